@@ -73,7 +73,7 @@ class Scene:
         with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
             made = mesh_of_scene(self.trained if support else replace(self.trained, dataset=None), chosen)
         about = {"up": made.up, "up_source": made.up_source, "length_unit": made.unit, "options": vars(chosen)}
-        size = {"volume": made.report.volume_m3, "area": made.report.area_m2}
+        size = {"volume": made.figures.volume_m3, "area": made.figures.area_m2}
         return blocks_of(made.built.mesh, {**about, "mesh": size})
 
 

@@ -113,7 +113,7 @@ class Recorder:
             )
         config = run / "config.yml"
         self.run("evaluate", "ns-eval", "--load-config", config, "--output-path", work / "eval.json")
-        every = ("vtu", "xdmf", "msh", "inp", "stl", "ply", "glb")
+        every = ("vtu", "xdmf", "msh", "inp", "glb")
         for name, options in {
             "conforming": ("--formats", *every),
             "voxel": ("--boundary", "voxel", "--formats", *every),
@@ -152,7 +152,7 @@ class Recorder:
             "bytes": {
                 name: digest(path.read_bytes())
                 for name, path in files.items()
-                if path.suffix in (".msh", ".inp", ".stl", ".ply", ".glb", ".csv", ".h5", ".xdmf")
+                if path.suffix in (".msh", ".inp", ".glb", ".csv", ".h5", ".xdmf")
             },
             "columns": {n: path.read_text().splitlines()[0] for n, path in files.items() if path.suffix == ".csv"},
         }

@@ -88,7 +88,6 @@ def house_findings(
 
     Areas and the number of bridges have no interval: both of its ends are what was found.
     """
-    assert mesh.boundary is not None
     others = tuple(name for name in mesh.boundary.patch_names if name not in ELEMENTS)
     found = audit(mesh, replace(conditions, leave_out=others), UP)
     difference = float(truth.draws["inside air"][0] - truth.draws["outside air"][0])

@@ -7,7 +7,7 @@ from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import build_mesh
-from thermoxels_ns.mesh.quality.report import check_mesh
+from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 BODIES = ("sphere", "torus", "cylinder", "slab at 30 degrees", "slab at 45 degrees")

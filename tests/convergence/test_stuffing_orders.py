@@ -6,7 +6,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, on_surface, stiffness, tet_mesh
-from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
+from thermoxels_ns.mesh.quality.checks import MeshFigures, check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import facet_areas, facet_normals
@@ -16,7 +16,7 @@ SHARP = tuple(name for name in SHAPES if SHAPES[name].sharp_edges)
 
 
 @cache
-def quality(name: str, cells: int, voxels_to_one: float = 1.5) -> QualityReport:
+def quality(name: str, cells: int, voxels_to_one: float = 1.5) -> MeshFigures:
     return check_mesh(tet_mesh(stuff(SHAPES[name].level(cells, voxels_to_one)), 2.0 / cells))
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble, backward_euler
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp
+from thermoxels_ns.mesh.files.solvers import write_inp
 from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 pytestmark = pytest.mark.external
@@ -34,15 +34,7 @@ def capacities(problem: HeatProblem) -> dict[str, HeatMatrices]:
 
 
 def run_calculix(folder: Path, problem: HeatProblem, time: TimeSteps, ccx: str, run_in) -> npt.NDArray[np.float64]:
-    material = problem.material
-    step = HeatStep(
-        material.conductivity_w_mk,
-        material.density_kg_m3,
-        material.specific_heat_j_kgk,
-        steps=time.steps,
-        step_seconds=time.step_seconds,
-    )
-    write_inp(folder / "house.inp", problem.mesh, step)
+    write_inp(folder / "house.inp", problem.mesh, steps=time.steps, step_seconds=time.step_seconds)
     said = run_in(folder, [ccx, "house"])
     assert "Job finished" in said
     assert "*WARNING" not in said and "*ERROR" not in said, said
@@ -75,7 +67,7 @@ def test_steps_of_an_awkward_length_are_all_taken(tmp_path, heat_problem, progra
 def test_surfaces_and_sets_are_the_patches(tmp_path, heat_problem, program, run_in):
     """A heat flux on a surface brings what its area asks for; a node set holds its nodes at a temperature."""
     mesh, seconds, flux_w_m2, held_c = heat_problem.mesh, 1e4, 50.0, -40.0
-    write_inp(tmp_path / "plain.inp", mesh, HeatStep(1.7, 2200.0, 880.0, steps=1, step_seconds=seconds))
+    write_inp(tmp_path / "plain.inp", mesh, steps=1, step_seconds=seconds)
     plain, ccx = (tmp_path / "plain.inp").read_text(), program("ccx", "calculix-ccx")
     surfaces = re.findall(r"\*SURFACE, NAME=([^,]+),", plain)
     used = np.unique(mesh.boundary.patch)

@@ -30,7 +30,6 @@ def body(**changes: Any) -> HeatProblem:
 
 
 def tagged(**changes: Any) -> HeatSystem:
-    assert BOX.boundary is not None
     return HeatSystem(body(boundary=replace(BOX.boundary, **changes)))
 
 

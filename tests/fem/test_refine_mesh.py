@@ -62,7 +62,7 @@ def test_children_inherit() -> None:
     mesh = notched()
     fine = refine_mesh(mesh)
     tags, finer = mesh.boundary, fine.boundary
-    assert tags is not None and finer is not None and mesh.colour is not None and fine.colour is not None
+    assert mesh.colour is not None and fine.colour is not None
     np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
     for name in ("patch", "seen"):
         np.testing.assert_array_equal(getattr(finer, name), np.repeat(getattr(tags, name), 4, axis=0))

@@ -80,7 +80,6 @@ def test_a_room_without_a_floor_is_named() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
     assert inner_surface_warnings(scene, room(), Z_UP) == ((), ())
     mesh = room()
-    assert mesh.boundary is not None
     floor = (facet_normals(mesh.points_m, mesh.facets)[:, 2] > 0.5) & np.char.startswith(
         np.array(mesh.boundary.patch_names)[mesh.boundary.patch], "interior"
     )
@@ -192,7 +191,6 @@ def test_parts_that_touch_without_shared_nodes_are_solved_and_said_to_exchange_n
     first = box_mesh(axis, axis, axis, temperature_c=15.0)
     second = replace(first, points_m=first.points_m + np.array([0.4, 0.0, 0.0]))
     tags = first.boundary
-    assert tags is not None
     patch = np.concatenate([np.where(tags.patch == inner, 2, tags.patch) for inner in (1, 0)])
     mesh = replace(both(first, second), boundary=replace(tags, patch=patch, seen=np.concatenate([tags.seen] * 2)))
     airs = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)

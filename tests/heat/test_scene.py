@@ -200,7 +200,6 @@ def test_patches_that_the_mesh_does_not_have_are_named() -> None:
 
 def test_patch_names_with_the_letters_of_patterns() -> None:
     mesh = room()
-    assert mesh.boundary is not None
     names = tuple(f"{name} [*]" for name in mesh.boundary.patch_names)
     mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
     roofs = (Surface(absorptivity=0.6, patches=("*-up*",)),)

@@ -10,8 +10,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh import temperature
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
 from thermoxels_ns.mesh.build import build_mesh
-from thermoxels_ns.mesh.quality.checks import component_of
-from thermoxels_ns.mesh.quality.report import check_mesh
+from thermoxels_ns.mesh.quality.checks import check_mesh, component_of
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.temperature import extend_harmonically, interpolate_corners
@@ -40,7 +39,7 @@ def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, mirror, mode
     density[:3, :3, 2:] = 0.0
     field = snapshot_of(density, lo=(-1.0, 2.0, 0.5), voxel_size=0.25)
     built = build_mesh(field, DENSE, linear_map(3.0 * linear, (5.0, -7.0, 1.0)), mode)
-    quality = check_mesh(built.mesh, mode)  # positive volumes, facets outwards
+    quality = check_mesh(built.mesh)  # positive volumes, facets outwards
     exact = built.solid.cells.sum() * (0.25 * 3.0) ** 3
     assert quality.volume_m3 == pytest.approx(exact, rel=1e-12 if mode == "voxel" else 0.2)
 
@@ -127,7 +126,7 @@ def test_the_area_is_that_of_the_surface_or_of_its_staircase(snapshot_of, mode):
     turn = rotation(6)
     mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * turn), mode).mesh
     boundary = mesh.boundary
-    assert boundary is not None and boundary.seen.all()  # without cameras nothing is known to be hidden
+    assert boundary.seen.all()  # without cameras nothing is known to be hidden
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
     more, bound = {"conforming": (1.0, 0.03), "voxel": (1.5, 0.1)}[mode]
     assert facet_areas(mesh.points_m, mesh.facets).sum() == pytest.approx(more * 4 * np.pi * radius**2, rel=bound)

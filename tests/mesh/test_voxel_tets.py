@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.report import check_mesh
+from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, facet_areas
 
 
@@ -36,13 +37,13 @@ PATTERNS = {
 @pytest.mark.parametrize("name", PATTERNS)
 def test_volume_area_and_validity(mesh_of_cells, name):
     cells = PATTERNS[name]
-    quality = check_mesh(mesh_of_cells(cells, voxel_size=0.5))
-    assert quality.num_tets == 6 * cells.sum()
+    mesh = mesh_of_cells(cells, voxel_size=0.5)
+    quality = check_mesh(mesh)
+    assert signed_volumes(mesh.points_m, mesh.tets) == pytest.approx(np.full(6 * cells.sum(), 0.5**3 / 6), rel=1e-14)
     assert quality.volume_m3 == pytest.approx(cells.sum() * 0.5**3, rel=1e-14)
-    assert quality.num_facets == 2 * exposed_faces(cells)
+    assert len(mesh.facets) == 2 * exposed_faces(cells)
     assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.5**2, rel=1e-14)
-    assert quality.criteria[0].figure == pytest.approx(0.5**3 / 6, rel=1e-14)
-    assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
+    assert quality.dihedral_range_deg == pytest.approx((45.0, 90.0))
 
 
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):

@@ -26,7 +26,6 @@ MOST_RATIO = 2.6
 def many_patches(count: int) -> TetMesh:
     """A box whose surface is divided into patches p0, p1, ..."""
     mesh = box_mesh(*(planes(0.0, 1.0, step=0.125) for _ in range(3)))
-    assert mesh.boundary is not None
     names = tuple(f"p{number}" for number in range(count))
     return replace(mesh, boundary=replace(mesh.boundary, patch=np.arange(len(mesh.facets)) % count, patch_names=names))
 

@@ -107,7 +107,6 @@ def house_mesh(step: float = 0.1, slab: bool = True) -> TetMesh:
     patches = {"outside": lambda c, n: np.ones(len(c), bool), **{name: named(name) for name, *_ in _RULES}}
     patches |= {"room": in_room, "cut": lambda c, n: (c[:, 2] < 1e-9) & (n[:, 2] < -0.5)}
     mesh = box_mesh(x, y, z, regions=regions, patches=patches, keep=kept)
-    assert mesh.boundary is not None
     names = mesh.boundary.patch_names
     seen = ~np.isin(mesh.boundary.patch, [names.index("room"), names.index("cut")])
     return dataclasses.replace(mesh, boundary=dataclasses.replace(mesh.boundary, seen=seen))

@@ -118,7 +118,6 @@ def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True, side
     if window:
         patches["window"] = lambda c, n: outer(c, n) & in_window(c) & (np.abs(c[:, 1]) < 1e-9)
     mesh = box_mesh(x, y, z, regions=regions, patches=patches, keep=lambda p: (p[..., 1] > 0.0) | in_slab(p))
-    assert mesh.boundary is not None
     names, patch = mesh.boundary.patch_names, mesh.boundary.patch
     tags = np.where(patch == names.index("cut"), FACET_BOX, 0)
     shown = ("room",) if side == "inside" else ("facade", "window")

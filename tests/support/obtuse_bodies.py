@@ -7,9 +7,10 @@ import numpy as np
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import Nodal, box_mesh
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh, volumes_and_angles
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import OVERSHOOT_K
+from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
@@ -78,7 +79,7 @@ def at_the_angle_bounds() -> TetMesh:
         for _ in range(26):
             before = points[node].copy()
             points[node] = before + step * direction
-            _, least, most = volumes_and_angles(points, tets)
+            least, most = dihedral_range_deg(points, tets)
             corner = points[tets]
             if least < low or most > high or np.linalg.det(corner[:, 1:] - corner[:, :1]).min() <= 0.0:
                 points[node], step = before, 0.5 * step

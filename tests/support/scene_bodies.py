@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 
 from tests.support.heat_bodies import make_body
-from thermoxels_ns.mesh.boundary.patches import default_patches
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
+from thermoxels_ns.mesh.boundary.patches import PatchRules, with_patches
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 
 Z_UP = (0.0, 0.0, 1.0)
 
@@ -25,9 +25,9 @@ def tagged_body(
     corners = np.rint(mesh.points_m / voxel_m)
     normals, middle = facet_normals(corners, mesh.facets), corners[mesh.facets].mean(axis=1)
     beyond = np.floor(middle + 0.5 * normals).astype(int) + 1
-    patch, names = default_patches(normals, Z_UP, outside[tuple(beyond.T)], middle[:, 0] < cut_below_x)
-    tags = Boundary(np.ones(len(normals), bool), patch, names)
-    return replace(mesh, region_names=("solid", "slab"), boundary=tags)
+    cut = np.where(middle[:, 0] < cut_below_x, FACET_BOX, mesh.facet_tags)
+    tagged, _ = with_patches(replace(mesh, facet_tags=cut), PatchRules(), Z_UP, outside[tuple(beyond.T)])
+    return replace(tagged, region_names=("solid", "slab"), facet_tags=mesh.facet_tags)
 
 
 def room(from_within: bool = False) -> TetMesh:
@@ -48,7 +48,6 @@ def wall() -> TetMesh:
     outside = np.zeros((3, 6, 3), dtype=bool)
     outside[:, 5] = True
     mesh = tagged_body(cells, 0.05, outside)
-    assert mesh.boundary is not None
     across = np.abs(facet_normals(mesh.points_m, mesh.facets)[:, 1]) < 0.5
     patch = np.where(across, mesh.boundary.patch_names.index("cut"), mesh.boundary.patch)
     return replace(mesh, boundary=replace(mesh.boundary, patch=patch))

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import skfem
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
+from skfem.models.poisson import laplace
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
 
@@ -36,10 +36,7 @@ def on_surface(solid: StuffedSolid) -> np.ndarray:
 
 def num_bodies(solid: StuffedSolid) -> int:
     """Parts of the mesh that share no node."""
-    start, end = solid.tets[:, [0, 0, 0]].ravel(), solid.tets[:, 1:].ravel()
-    nodes = len(solid.points)
-    graph = sparse.coo_array((np.ones(len(start)), (start, end)), shape=(nodes, nodes))
-    return int(connected_components(graph, directed=False)[0])
+    return len(np.unique(component_of(len(solid.points), solid.tets[:, :3].ravel(), solid.tets[:, 1:].ravel())))
 
 
 def euler_characteristic(solid: StuffedSolid) -> int:
@@ -50,13 +47,7 @@ def euler_characteristic(solid: StuffedSolid) -> int:
 
 def stiffness(points: np.ndarray, tets: np.ndarray) -> sparse.csr_array:
     """Stiffness matrix of linear elements for a conductivity of 1."""
-    corners = points[tets]
-    matrices = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    gradients = np.linalg.inv(matrices)
-    gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
-    local = np.linalg.det(matrices)[:, None, None] / 6.0 * (gradients @ np.swapaxes(gradients, 1, 2))
-    place = (np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel())
-    return sparse.coo_array((local.ravel(), place), shape=(len(points), len(points))).tocsr()
+    return sparse.csr_array(laplace.assemble(skfem.Basis(skfem.MeshTet(points.T, tets.T), skfem.ElementTetP1())))
 
 
 def turn(degrees: float) -> np.ndarray:
@@ -117,14 +108,3 @@ SHAPES: dict[str, Shape] = {
     "slab at 30 degrees": _slab(30.0),
     "slab at 45 degrees": _slab(45.0),
 }
-
-
-def volumes_and_angles(points: FloatArray, tets: IntArray) -> tuple[FloatArray, float, float]:
-    """Signed volumes (t,), [m^3], smallest and largest dihedral angle, [degrees]; 0 at a face without area."""
-    volumes = np.empty(len(tets))
-    low, high = 1.0, -1.0
-    for which, shapes in shapes_in_chunks(points, tets):
-        volumes[which] = shapes.volumes
-        cosines = shapes.dihedral_cosines()
-        low, high = min(low, float(cosines.min())), max(high, float(cosines.max()))
-    return volumes, float(np.degrees(np.arccos(high))), float(np.degrees(np.arccos(low)))

@@ -103,7 +103,7 @@ class AuditedSurface:
         everywhere on a mesh that was not made of photographs.
         """
         facets, tags = self.mesh.facets, self.mesh.boundary
-        if tags is None or tags.photographs is None:
+        if tags.photographs is None:
             return np.zeros(len(facets))
         sides = np.stack(group_sides(facets).pairs(), axis=1)
         inner, patch = sides // 3, self.selection.facet_patch
@@ -141,12 +141,9 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     """Find the boundary triangles that count: seen, measured at all three nodes, not cut and not left out.
 
     Raises:
-        AuditError: The mesh has no boundary tags, the conditions name a patch that the mesh does not have, a patch
-            with readings has no emissivity, or no triangle counts.
+        AuditError: The conditions name a patch that the mesh does not have, a patch with readings has no emissivity,
+            or no triangle counts.
     """
-    if mesh.boundary is None:
-        remedy = "Export it with ns-export thermoxels-mesh."
-        raise AuditError("mesh", expected="one whose boundary has tags", got="one without", remedy=remedy)
     selection, tags = Selection(mesh, up), mesh.boundary
     names = selection.patch_names
     entry_of_patch = np.full(len(names), -1)

@@ -222,7 +222,6 @@ def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: S
     building = find_building(mesh, up, north)
     rules = proposed_rules(building)
     tagged, _ = with_patches(mesh, rules, up)
-    assert tagged.boundary is not None
     patch, names = tagged.boundary.patch, tagged.boundary.patch_names
     areas = ", ".join(f"{one.name} {one.net_area_m2:.1f}" for one in building.every() if len(one.facets))
     say(f"Found, [m2]: {areas}. {100 * building.left_out:.0f} % of the volume stands out from walls or is not flat.")

@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from thermoxels_ns.core.snapshot import GridSnapshot
     from thermoxels_ns.mesh.boundary.patches import PatchRules
     from thermoxels_ns.mesh.build import BuiltMesh
-    from thermoxels_ns.mesh.quality.report import QualityReport
+    from thermoxels_ns.mesh.quality.checks import MeshFigures
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
     from thermoxels_ns.multiview.stereo import Depths
 
 Say = Callable[[str], None]
 
-_SUMMARY, _QUALITY = "summary.json", "quality.json"
+_SUMMARY, _UNFINISHED = "summary.json", "summary-unfinished.json"
 _PICTURES = ("mesh.png", "mesh-measured.png", "region.png", "support.png")
 
 
@@ -87,9 +87,9 @@ class ExportOptions:
     known_distance_error: float | None = None
     """Standard error of the known distance, including the position errors of the two points, [m]; the summary then
     states the standard errors of area and volume."""
-    formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"], ...] = ("vtu", "glb")
+    formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "glb"], ...] = ("vtu", "glb")
     """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus: ten steps of 60 s
-    in concrete, to be changed in the file), stl, ply (surface), glb (browsers, phones)."""
+    in concrete, to be changed in the file), glb (surface: browsers, phones)."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of how photographs support its surface."""
 
@@ -122,10 +122,10 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class SceneMesh:
-    """The mesh of a trained scene, as it was checked, with its scale and its direction up."""
+    """The mesh of a trained scene, checked, with its figures, its scale and its direction up."""
 
     built: BuiltMesh
-    report: QualityReport
+    figures: MeshFigures
     scale: SceneScale | None
     unit: str  # Unit of length: m, or without a scale the input unit
     to_mesh: FloatArray  # Matrix from the trained scene to the mesh, shape (4, 4)
@@ -215,7 +215,8 @@ def prepare_folder(output_dir: Path | str) -> Path:
     """Make an export's folder, without half-written files; raises `OutputError` if it holds files of others."""
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
-    return result_folder(output_dir, (*_mesh_files(MESH_FORMATS), *_PICTURES, _QUALITY, _SUMMARY), _QUALITY)
+    mark = _SUMMARY if (Path(output_dir) / _SUMMARY).is_file() else _UNFINISHED
+    return result_folder(output_dir, (*_mesh_files(MESH_FORMATS), *_PICTURES, _UNFINISHED, _SUMMARY), mark)
 
 
 def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
@@ -224,7 +225,7 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     Raises `ThermoxelsError` if an option is wrong, a scale is needed and not known, or nothing is solid.
     """
     from thermoxels_ns.mesh.build import build_mesh
-    from thermoxels_ns.mesh.quality.report import check_mesh
+    from thermoxels_ns.mesh.quality.checks import check_mesh
     from thermoxels_ns.multiview.evidence import depths_of_dataset
 
     selection, rules, distance = check_options(options)
@@ -238,17 +239,16 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     if depths is not None:
         built = with_support(built, depths, run.tracks, lattice, to_mesh)
     unit = "input unit" if scale is None else "m"
-    report = check_mesh(built.mesh, options.boundary, built.observed_range_c, length_unit=unit)
-    return SceneMesh(built, report, scale, unit, to_mesh, up, up_source)
+    return SceneMesh(built, check_mesh(built.mesh), scale, unit, to_mesh, up, up_source)
 
 
 def export_scene(
     run: TrainedScene, options: ExportOptions, output_dir: Path | str, say: Say = lambda _: None
 ) -> dict[str, Any]:
-    """Write mesh files, quality.json, summary.json and pictures; return the content of summary.json.
+    """Write mesh files, summary.json and pictures; return the content of summary.json.
 
-    Everything is computed before anything is written. An old summary.json is removed first and the new summary.json is
-    written last, so files beside a summary.json belong together. Files of earlier exports that are not rewritten go.
+    Everything is computed before anything is written. The new summary is named summary-unfinished.json until all files
+    are written, so files beside a summary.json belong together. Files of earlier exports that are not rewritten go.
     `say` receives lines of progress.
 
     Raises:
@@ -256,35 +256,32 @@ def export_scene(
     """
     from thermoxels_ns.commands import export_summary
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
-    from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
-    from thermoxels_ns.mesh.files.surface import check_single_precision
+    from thermoxels_ns.mesh.files.solvers import check_start
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
 
     check_options(options)
     folder = prepare_folder(output_dir)
     made = mesh_of_scene(run, options)
-    mesh, report, unit = made.built.mesh, made.report, made.unit
+    mesh, figures, unit = made.built.mesh, made.figures, made.unit
     suffixes = [f".{name}" for name in options.formats]
-    if {".stl", ".ply"} & {*suffixes}:
-        check_single_precision(mesh)
     if ".inp" in suffixes:
         check_start(mesh)
     voxel_size = run.snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(made.to_mesh[:3, :3]))))
     say(f"Up: {', '.join(f'{value:.3g}' for value in made.up)}. {made.up_source}")
     asked_for = "near a point" if options.region_near else "a box" if options.region_box else options.region
     region = export_summary.region_summary(made.built, asked_for)
-    for line in export_summary.lines_on_mesh(made.built, region, report.volume_m3, unit, voxel_size):
+    for line in export_summary.lines_on_mesh(made.built, region, figures.volume_m3, unit, voxel_size):
         say(line)
     if options.boundary == "voxel":
         say(
-            f"Area {report.area_m2:.6g} {unit}^2, that of a staircase: convection, radiation and fluxes act on up to "
+            f"Area {figures.area_m2:.6g} {unit}^2, that of a staircase: convection, radiation and fluxes act on up to "
             "1.7 times the area of a slanted surface. For heat flows export with --boundary conforming."
         )
     if made.scale is None:
         say("The size of the scene is not known. For heat or an audit pass --metres-per-unit or --known-distance.")
     truth = _against_truth(run, made, say)
 
-    files = [*_mesh_files(suffixes), _QUALITY]
+    files = _mesh_files(suffixes)
     if options.pictures:
         files += _PICTURES[: 3 if support_of_facets(mesh) is None else 4]
     summary = {
@@ -295,23 +292,22 @@ def export_scene(
         "up": made.up,
         "up_source": made.up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(made.built, report, made.scale, voxel_size),
+        "mesh": export_summary.mesh_summary(made.built, figures, made.scale),
         "corrections": run.corrections,
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
     plain_values(summary, "summary", MeshError)  # raises if json cannot hold the summary
 
+    write_json(folder / _UNFINISHED, summary)  # marks the folder as an export's for `prepare_folder`
     remove_file(folder / _SUMMARY)
-    write_json(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
     for name in {*_mesh_files(MESH_FORMATS), *_PICTURES} - set(files):
         remove_file(folder / name)
-    in_concrete = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)  # the run of the Thermoxels paper
     for suffix in suffixes:
-        write_mesh(folder / f"mesh{suffix}", mesh, heat_step=in_concrete, up=made.up)
+        write_mesh(folder / f"mesh{suffix}", mesh, up=made.up)
     if options.pictures:
         _draw(folder, run, made)
-    write_json(folder / _SUMMARY, summary)
+    (folder / _UNFINISHED).rename(folder / _SUMMARY)
     say(f"Written to {folder}: {', '.join(summary['files'])}")
     return summary
 
@@ -359,7 +355,6 @@ def with_support(
     from thermoxels_ns.multiview.votes import supporting_photographs
 
     mesh = built.mesh
-    assert mesh.boundary is not None
     middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
     normal = facet_normals(mesh.points_m, mesh.facets) @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
     photographs = depths.photographs

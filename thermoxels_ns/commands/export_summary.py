@@ -13,7 +13,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.mesh.build import BuiltMesh
-from thermoxels_ns.mesh.quality.report import QualityReport
+from thermoxels_ns.mesh.quality.checks import MeshFigures
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidCells
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, support_of_facets
@@ -58,39 +58,29 @@ def lines_on_mesh(
         )
 
 
-def mesh_summary(
-    built: BuiltMesh, report: QualityReport, scale: SceneScale | None, voxel_size: float
-) -> dict[str, Any]:
+def mesh_summary(built: BuiltMesh, figures: MeshFigures, scale: SceneScale | None) -> dict[str, Any]:
     """Return the entry "mesh" of summary.json: counts, sizes and steps; lengths are in the summary's length_unit."""
     mesh, solid = built.mesh, built.solid
-    assert mesh.boundary is not None
     temperature = mesh.temperature_c
     of_triangles = facet_areas(mesh.points_m, mesh.facets)
     unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
-    litres = 1e3 * voxel_size**3
     return {
-        "boundary": report.boundary_mode,
-        "nodes": report.num_nodes,
-        "tets": report.num_tets,
+        "nodes": len(mesh.points_m),
+        "tets": len(mesh.tets),
         "voxels": int(np.count_nonzero(solid.cells)),
-        "boundary_triangles": report.num_facets,
-        "boundary_triangles_on_box": report.num_box_facets,
-        "non_manifold_edges": report.num_non_manifold_edges,
-        "volume": report.volume_m3,
-        "volume_standard_error": None if scale is None else scale.standard_error_of(report.volume_m3, 3),
-        "area": report.area_m2,
-        "area_standard_error": None if scale is None else scale.standard_error_of(report.area_m2, 2),
+        "boundary_triangles": len(mesh.facets),
+        "non_manifold_edges": figures.num_non_manifold_edges,
+        "volume": figures.volume_m3,
+        "volume_standard_error": None if scale is None else scale.standard_error_of(figures.volume_m3, 3),
+        "area": figures.area_m2,
+        "area_standard_error": None if scale is None else scale.standard_error_of(figures.area_m2, 2),
         "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
-        "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
+        "dihedral_angles_deg": {"min": figures.dihedral_range_deg[0], "max": figures.dihedral_range_deg[1]},
         "density_threshold_used": solid.threshold,
-        "density_threshold_why": solid.steps[0].remark,
         "solid_steps": [
-            {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed}
-            | ({} if scale is None else {"litres_added": litres * step.added, "litres_removed": litres * step.removed})
-            | {"remark": step.remark}
+            {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed, "remark": step.remark}
             for step in solid.steps
         ],
-        "component_sizes_voxels": solid.component_sizes,
         "parts_without_thermal_rays_left_out": built.unobserved_parts,
         "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
         "share_of_nodes_observed": float(np.mean(mesh.observed)),
@@ -106,7 +96,6 @@ def mesh_summary(
             "max": float(temperature.max()),
             "mean_of_nodes": float(temperature.mean()),
         },
-        "promises": {criterion.name: criterion.kept for criterion in report.criteria},
     }
 
 
@@ -138,7 +127,6 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
     support = support_of_facets(mesh)
     if support is None or not (support >= 0).any():
         return None
-    assert mesh.boundary is not None
     area = facet_areas(mesh.points_m, mesh.facets)
     total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
     return dict(zip(SUPPORT, (total / total.sum()).tolist()))

@@ -37,9 +37,7 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
         facets=facets[:, _FACET_CHILDREN].reshape(-1, 3),
         facet_tags=np.repeat(mesh.facet_tags, 4),
         region=np.repeat(mesh.region, 8),
-        boundary=None
-        if tags is None
-        else replace(
+        boundary=replace(
             tags,
             seen=np.repeat(tags.seen, 4),
             patch=np.repeat(tags.patch, 4),

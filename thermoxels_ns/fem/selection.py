@@ -19,10 +19,10 @@ class Selection:
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
         """Take a mesh that `TetMesh.check` accepts; `up` is the unit vector for `Places.up`."""
-        self.mesh, self.up, tags = mesh, up, mesh.boundary
-        self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
-        """Names of the patches; a mesh without tags has one, "boundary"."""
-        self.facet_patch: IntArray = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
+        self.mesh, self.up = mesh, up
+        self.patch_names: tuple[str, ...] = mesh.boundary.patch_names
+        """Names of the patches."""
+        self.facet_patch: IntArray = mesh.boundary.patch
         """Patch of each boundary triangle, as an index into `patch_names`, shape (f,)."""
 
     @cached_property

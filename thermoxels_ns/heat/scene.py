@@ -132,8 +132,6 @@ class HeatScene:
         A named patch is outside (``exterior-*``) if photographs show most of its area, else inside. Patches that
         another entry of the scene names are left to that entry.
         """
-        if mesh.boundary is None:
-            return self
         area, tags = Selection(mesh).facet_area_m2, mesh.boundary
         whole, seen = (np.bincount(tags.patch, area * part, len(tags.patch_names)) for part in (1.0, tags.seen))
         own = [n for n, name in enumerate(tags.patch_names) if name not in DEFAULT_PATCHES and whole[n] > 0.0]

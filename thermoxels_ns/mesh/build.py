@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
+from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions, with_patches
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
-from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import face_connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
@@ -24,8 +24,11 @@ from thermoxels_ns.mesh.temperature import (
     interpolate_corners,
     tet_conductances,
 )
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
+
+BoundaryMode = Literal["conforming", "voxel"]
+"""How the boundary of a mesh runs: "conforming" along the level set of the density, "voxel" along voxel faces."""
 
 _NO_RULES = PatchRules()
 
@@ -37,10 +40,7 @@ class BuiltMesh:
     mesh: TetMesh
     solid: SolidCells
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
-    unobserved_voxels: int  # number of voxels of these parts; `solid.component_sizes` counts them, `solid.cells` not
-    observed_range_c: tuple[float, float] | None
-    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; all nodes are within it. None:
-    no temperatures."""
+    unobserved_voxels: int  # number of voxels of these parts; `solid.cells` does not hold them
     idle_rules: tuple[str, ...] = ()
     """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
 
@@ -86,7 +86,7 @@ def build_mesh(
         level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells)
         stuffed = sharpen(stuff(level), level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
-    known, observed_range_c = snapshot.temperature_c, None
+    known = snapshot.temperature_c
     temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
     if known is not None:  # temperatures are interpolated from measured corners alone
         measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
@@ -110,8 +110,6 @@ def build_mesh(
         edges, conductance = edges[conductance > 0.0], conductance[conductance > 0.0]
     if known is not None:
         temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
-        measured_c = known[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
-        observed_range_c = float(measured_c.min()), float(measured_c.max())
 
     on_border = boundary_tags(facets, points, snapshot.lattice.shape)
     facet_tags = np.where(_cut_by_region(points, facets, solid.within), FACET_BOX, on_border)
@@ -135,10 +133,8 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    tags, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
-    return BuiltMesh(
-        replace(mesh, boundary=tags), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
-    )
+    tagged, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
+    return BuiltMesh(tagged, solid, parts, num_voxels, (*idle_patches, *idle_regions))
 
 
 def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
@@ -168,8 +164,8 @@ def _tagged(
     rotation: FloatArray,
     up: tuple[float, float, float],
     rules: PatchRules,
-) -> tuple[Boundary, tuple[str, ...]]:
-    """Return the tags of all boundary triangles and the idle rules; without cameras all triangles count as seen."""
+) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return the mesh with tags of all boundary triangles, and the idle rules; without cameras all count as seen."""
     normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:
@@ -182,16 +178,8 @@ def _tagged(
         inner = ~seen & grow(solid.rooms, 1)[tuple(beside.T)]
         # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
         outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
-    patch, names, idle = apply_patches(
-        rules,
-        centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
-        normals=normal,
-        up=up,
-        seen=outside,
-        on_box=mesh.facet_tags == FACET_BOX,
-        colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
-    )
-    return Boundary(seen=seen, patch=patch, patch_names=names), idle
+    tagged = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
+    return with_patches(tagged, rules, up, outside)
 
 
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:

@@ -47,9 +47,16 @@ class TetMesh:
     facet_tags: IntArray  # `FACET_SURFACE` or `FACET_BOX` for each boundary triangle, shape (f,)
     region: IntArray  # region of each tetrahedron, an index into `region_names`, shape (t,)
     region_names: tuple[str, ...] = ("solid",)  # names of the regions, all different
-    boundary: Boundary | None = None  # tags of the boundary triangles; None if the mesh has no tags
+    boundary: Boundary = None  # type: ignore[assignment]
+    """Tags of the boundary triangles. Left out: all are seen and belong to one patch, "boundary"."""
     colour: Float32Array | None = None
     """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if colours are not known."""
+
+    def __post_init__(self) -> None:
+        if self.boundary is None:
+            count = len(self.facets)
+            whole = Boundary(np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64), ("boundary",))
+            object.__setattr__(self, "boundary", whole)
 
     @property
     def has_temperatures(self) -> bool:
@@ -57,7 +64,7 @@ class TetMesh:
         return not bool(np.isnan(self.temperature_c).all())
 
     def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
-        """Check that the arrays fit each other; `quality.report.check_mesh` checks the geometry.
+        """Check that the arrays fit each other; `quality.checks.check_mesh` checks the geometry.
 
         Messages begin with `name` and end with `remedy`.
 
@@ -74,18 +81,14 @@ class TetMesh:
             ("facets", self.facets, (None, 3), nodes),
             ("facet_tags", self.facet_tags, (facets,), None),
             ("region", self.region, (tets,), len(self.region_names)),
+            ("boundary.seen", tags.seen, (facets,), None),
+            ("boundary.patch", tags.patch, (facets,), len(tags.patch_names)),
         ]
-        names = {"region_names": self.region_names}
+        names = {"region_names": self.region_names, "boundary.patch_names": tags.patch_names}
         if self.colour is not None:
             arrays.append(("colour", self.colour, (nodes, 3), None))
-        if tags is not None:
-            names["boundary.patch_names"] = tags.patch_names
-            arrays += [
-                ("boundary.seen", tags.seen, (facets,), None),
-                ("boundary.patch", tags.patch, (facets,), len(tags.patch_names)),
-            ]
-            if tags.photographs is not None:
-                arrays.append(("boundary.photographs", tags.photographs, (facets, 2), None))
+        if tags.photographs is not None:
+            arrays.append(("boundary.photographs", tags.photographs, (facets, 2), None))
         if tets == 0:
             raise MeshError(f"{name} tets", expected="at least one tetrahedron", got="none", remedy=remedy)
         for what, entries in names.items():
@@ -107,7 +110,7 @@ def support_of_facets(mesh: TetMesh) -> IntArray | None:
 
     The result is None if photographs were not compared.
     """
-    if mesh.boundary is None or mesh.boundary.photographs is None:
+    if mesh.boundary.photographs is None:
         return None
     seen, supporting = mesh.boundary.photographs.T
     on_box = mesh.facet_tags == FACET_BOX
@@ -130,3 +133,13 @@ def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
     vectors = facet_area_vectors(points, facets)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
+
+
+def nodes_and_triangles(facets: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the nodes that triangles (f, 3) use, ascending, shape (m,), and the triangles in numbers of these, (f, 3).
+
+    >>> nodes_and_triangles(np.array([[3, 0, 2]]))[1].tolist()
+    [[2, 0, 1]]
+    """
+    nodes, triangles = np.unique(facets, return_inverse=True)
+    return nodes, triangles.reshape(-1, 3)

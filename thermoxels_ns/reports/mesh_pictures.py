@@ -241,9 +241,7 @@ def draw_surface(
     Colours of the surface span the part that photographs show, because the inside of a heated building is far warmer.
     States are nodal temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s].
     """
-    seen = mesh.facet_tags != FACET_BOX
-    if mesh.boundary is not None:
-        seen = seen & mesh.boundary.seen
+    seen = (mesh.facet_tags != FACET_BOX) & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
     when = ", steady" if len(times_s) == 1 else f" at {duration_text(float(times_s[-1]))}"
     clim, note = colour_range(states_c[-1][shown])

@@ -86,19 +86,8 @@ def test_all_conditions_of_a_rule_hold(tmp_path: Path, rule: str, changed: list[
 COLOURS = np.array([[1.0, 0, 0], [0.9, 0, 0], [0.5, 0, 0], [0.1, 0, 0], [0.0, 0, 0], [0.4, 0.3, 0.0]])
 
 
-def test_the_nearest_colour_wins_whatever_the_order(tmp_path: Path) -> None:
-    red = "{name: red, nearest_colour: {rgb: [255, 0, 0]}}"
-    black = "{name: black, nearest_colour: {rgb: [0, 0, 0]}}"
-    expected = ["red", "red", None, "black", "black", "black"]
-    for order in ([red, black], [black, red]):
-        found = named(rules_of(tmp_path, f"patches: [{', '.join(order)}]"), COLOURS)
-        assert [name for name, want in zip(found, expected) if want] == [want for want in expected if want]
-    # The third is exactly half-way: the later one has it.
-    assert found[2] == "red"
-
-
-def test_a_colour_that_is_too_far_is_nobodys(tmp_path: Path) -> None:
-    rule = "patches: [{name: red, nearest_colour: {rgb: [204, 0, 0], max_distance: 51.5}}]"
+def test_a_colour_is_met_up_to_its_distance(tmp_path: Path) -> None:
+    rule = "patches: [{name: red, colour: {rgb: [204, 0, 0], max_distance: 51.5}}]"
     names = named(rules_of(tmp_path, rule), COLOURS)
     assert names == ["red", "red", *BEFORE[2:]]
 
@@ -110,7 +99,7 @@ def test_regions_go_by_box_plane_and_colour(tmp_path: Path) -> None:
 regions:
   - {name: slab, box: {lower: [-.inf, -.inf, -.inf], upper: [.inf, .inf, 0.3]}}
   - {name: east, plane: {point: [2, 0, 0], normal: [1, 0, 0]}}
-  - {name: brick, nearest_colour: {rgb: [255, 0, 0], max_distance: 30}}
+  - {name: brick, colour: {rgb: [255, 0, 0], max_distance: 30}}
   - {name: slab, box: {lower: [9, 9, 9], upper: [10, 10, 10]}}
 """,
     )
@@ -158,9 +147,10 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         ("patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]", "plane: point and normal"),
         ("patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 1], depth: 0}}]", "plane: depth"),
         ("patches: [{name: a, facing: [0, 0, 0]}]", "facing"),
-        ("patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]", "rgb"),
-        ("patches: [{name: a, nearest_colour: {rgb: [0.5, 0, 0]}}]", "rgb"),
-        ("patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]", "max_distance"),
+        ("patches: [{name: a, colour: {rgb: [0, 0, 256], max_distance: 9}}]", "rgb"),
+        ("patches: [{name: a, colour: {rgb: [0.5, 0, 0], max_distance: 9}}]", "rgb"),
+        ("patches: [{name: a, colour: {rgb: [9, 0, 0], max_distance: 0}}]", "max_distance"),
+        ("patches: [{name: a, colour: {rgb: [9, 0, 0]}}]", "colour"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, text: str, where: str) -> None:

@@ -72,7 +72,7 @@ def test_the_proposed_rules_give_the_elements_back(mesh, tmp_path) -> None:
     tagged, building = mesh(), find_building(mesh(), UP, NORTH)
     write_patch_rules(tmp_path / "patches.yaml", proposed_rules(building), "proposed")
     tagged, idle = with_patches(tagged, load_patch_rules(tmp_path / "patches.yaml"), UP)
-    assert tagged.boundary is not None and idle == ()
+    assert idle == ()
     vectors = facet_area_vectors(tagged.points_m, tagged.facets)
     for one in (one for one in building.every() if len(one.facets)):
         mine = tagged.boundary.patch == tagged.boundary.patch_names.index(one.name)

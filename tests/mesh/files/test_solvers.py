@@ -15,13 +15,11 @@ from thermoxels_ns.mesh.files.solvers import (
     BODY_GRID,
     FACET_GRID,
     TEMPERATURE_VIEW,
-    HeatStep,
     write_inp,
     write_msh,
     write_xdmf,
 )
 
-STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
 FACE_NODES = {1: (1, 2, 3), 2: (1, 4, 2), 3: (2, 4, 3), 4: (3, 4, 1)}
 
@@ -44,7 +42,7 @@ def numbers(lines: list[list[str]]) -> list[int]:
 
 @pytest.fixture
 def written(tmp_path, tagged_mesh) -> dict[str, list[list[str]]]:
-    write_inp(tmp_path / "house.inp", tagged_mesh, STEP)
+    write_inp(tmp_path / "house.inp", tagged_mesh)
     return sections(tmp_path / "house.inp")
 
 
@@ -97,10 +95,10 @@ def test_materials_temperatures_and_times(written, tagged_mesh):
     assert list(written)[-1] == "*END STEP"
 
 
-@pytest.mark.parametrize("names", [("wall a", "wall-a", "roof"), ("a", "A", "b"), ("a", "b", "c" * 61)])
+@pytest.mark.parametrize("names", [("wall a", "wall-a", "roof"), ("a", "A", "b")])
 def test_names_that_become_one_are_refused(tmp_path, tagged_mesh, names):
     with pytest.raises(MeshError, match="region_names: expected"):
-        write_inp(tmp_path / "house.inp", dataclasses.replace(tagged_mesh, region_names=names), STEP)
+        write_inp(tmp_path / "house.inp", dataclasses.replace(tagged_mesh, region_names=names))
     assert not list(tmp_path.iterdir())
 
 
@@ -120,13 +118,6 @@ def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):
     for block, tags, (cells, index) in zip(read.cells, read.cell_data["gmsh:physical"], ours, strict=True):
         assert np.array_equal(block.data, cells) and np.array_equal(tags, index + 1)
     assert np.array_equal(read.point_data[TEMPERATURE_VIEW].ravel(), tagged_mesh.temperature_c)
-
-
-def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):
-    names = ("walls", "floor", "é" * 64)
-    with pytest.raises(MeshError, match="got 128 bytes"):
-        write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, region_names=names))
-    assert not list(tmp_path.iterdir())
 
 
 def read_grids(path) -> dict[str, pv.UnstructuredGrid]:
@@ -151,7 +142,6 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
-        assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
         assert np.array_equal(grid.point_data["observed"], tagged_mesh.observed)
         assert grid.point_data["colour"].shape == tagged_mesh.colour.shape
 

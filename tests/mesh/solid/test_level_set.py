@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.stuffed_shapes import volumes_and_angles
+from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
@@ -82,7 +82,7 @@ def meshed(cells: np.ndarray) -> StuffedSolid:
 
 def share_kept(cells: np.ndarray) -> float:
     solid = meshed(cells)
-    _, low, high = volumes_and_angles(solid.points, solid.tets)
+    low, high = dihedral_range_deg(solid.points, solid.tets)
     assert low >= 10.7 and high <= 164.8
     return float(signed_volumes(solid.points, solid.tets).sum() / np.count_nonzero(cells))
 

@@ -68,12 +68,7 @@ class Colour:
     """Condition of a rule: the element's colour is at most `max_distance` from `rgb`."""
 
     rgb: tuple[_Byte, _Byte, _Byte]  # Red, green and blue, whole numbers from 0 to 255
-    max_distance: Annotated[float, Field(gt=0)] = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
-
-    def distance(self, colours: npt.NDArray) -> FloatArray:
-        """Return the distances (n,) of colours (n, 3), in [0, 1], to `rgb`; infinite if beyond `max_distance`."""
-        distance = np.linalg.norm(colours - np.array(self.rgb) / 255.0, axis=1)
-        return np.where(distance <= self.max_distance / 255.0, distance, np.inf)
+    max_distance: Annotated[float, Field(gt=0)]  # Largest Euclidean distance to `rgb`, on the same scale
 
 
 @dataclass(frozen=True)
@@ -83,8 +78,7 @@ class RegionRule:
     name: str  # Name of the patch or region; several rules may have one name
     box: Box | None = None
     plane: Plane | None = None
-    nearest_colour: Colour | None = None
-    """Of all rules with a colour whose other conditions hold, an element meets only the one with the nearest colour."""
+    colour: Colour | None = None
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -162,18 +156,6 @@ def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
     return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
 
 
-def default_patches(
-    normals: FloatArray, up: npt.ArrayLike, seen: BoolArray, on_box: BoolArray
-) -> tuple[IntArray, tuple[str, ...]]:
-    """Return each triangle's default patch, shape (f,), and the names of all default patches.
-
-    The patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is False,
-    followed by the direction of `facing`, as in "exterior-up". The arguments are those of `apply_patches`.
-    """
-    patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
-    return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
-
-
 def apply_patches(
     rules: PatchRules,
     *,
@@ -184,10 +166,13 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Return each triangle's patch: by the last rule that it meets, else by `default_patches`, whose names come first.
+    """Return each triangle's patch: by the last rule that it meets, else one of `DEFAULT_PATCHES`.
+
+    The default patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is
+    False, followed by the direction of `facing`, as in "exterior-up".
 
     Args:
-        rules: The user's rules; without any, the default patches come back.
+        rules: The user's rules.
         centroids_m: Centroid of each boundary triangle, shape (f, 3), [m].
         normals: Outward unit normals in the axes of the centroids, shape (f, 3).
         up: Up direction in the axes of the centroids.
@@ -198,8 +183,8 @@ def apply_patches(
     Raises:
         MeshError: A rule has a colour but `colours` is None, or `up` is no direction.
     """
-    patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
+    patch = np.where(on_box, DEFAULT_PATCHES.index("cut"), np.where(seen, 0, len(FACINGS)) + direction)
     everywhere = np.ones(len(patch), dtype=bool)
     parts = {"exterior": ~on_box & seen, "interior": ~on_box & ~seen, "cut": on_box}
     facings = {name: direction == number for number, name in enumerate(FACINGS)}
@@ -210,20 +195,22 @@ def apply_patches(
         return facings.get(rule.facing or "any", everywhere)
 
     allowed = [parts.get(rule.only or "all", everywhere) & faces(rule) for rule in rules.patches]
-    return _applied(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
+    return _applied(rules.patches, "patch", allowed, patch, DEFAULT_PATCHES, centroids_m, colours)
 
 
-def with_patches(mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike) -> tuple[TetMesh, tuple[str, ...]]:
-    """Return a tagged mesh with patches by a user's rules in place of its own, and the idle rules."""
-    if mesh.boundary is None:
-        remedy = "Export it with ns-export thermoxels-mesh."
-        raise MeshError("mesh", expected="one whose boundary has tags", got="one without", remedy=remedy)
+def with_patches(
+    mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike, outside: BoolArray | None = None
+) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return a mesh with patches by a user's rules in place of its own, and the idle rules.
+
+    `outside`, shape (f,), is True for triangles that count as exterior; None: those that cameras see.
+    """
     patch, names, idle = apply_patches(
         rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=facet_normals(mesh.points_m, mesh.facets),
         up=up,
-        seen=mesh.boundary.seen,
+        seen=mesh.boundary.seen if outside is None else outside,
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )
@@ -268,7 +255,7 @@ def _applied(
     count, remedy = len(start), f"Pass one centroid per element that gets a {kind}."
     check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)
-    closest, winner, matches = np.full(count, np.inf), np.full(count, -1), []
+    owner = np.full(count, -1, dtype=np.int64)
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()
         if rule.box is not None:
@@ -276,19 +263,15 @@ def _applied(
         if rule.plane is not None:
             distance = (centroids - rule.plane.point) @ np.array(rule.plane.normal)
             inside &= (distance >= 0.0) & (distance <= rule.plane.depth * math.hypot(*rule.plane.normal))
-        if rule.nearest_colour is not None:
+        if rule.colour is not None:
             if colours is None:
-                expected = "a mesh with colours, because its rule is by nearest_colour"
+                expected = "a mesh with colours, because its rule is by colour"
                 remedy = "Use box or plane, or a model that was trained on colour photographs."
                 raise MeshError(f"{kind} {rule.name}", expected=expected, got="a mesh without", remedy=remedy)
-            distance = np.where(inside, rule.nearest_colour.distance(colours), np.inf)
-            wins = np.isfinite(distance) & (distance <= closest)
-            closest[wins], winner[wins] = distance[wins], number
-        matches.append(inside)
+            away = np.linalg.norm(255.0 * colours - np.array(rule.colour.rgb), axis=1)
+            inside &= away <= rule.colour.max_distance
+        owner[inside] = number
 
-    owner = np.full(count, -1, dtype=np.int64)
-    for number, (rule, match) in enumerate(zip(rules, matches)):
-        owner[match if rule.nearest_colour is None else winner == number] = number
     all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
     index = np.append([all_names.index(rule.name) for rule in rules], 0).astype(np.int64)[owner]
     followed = np.bincount(owner[owner >= 0], minlength=len(rules)) > 0

@@ -1,1 +1,1 @@
-"""Mesh files for other programs: writers for seven formats, and a reader for .vtu."""
+"""Mesh files for other programs: writers for five formats, and a reader for .vtu."""

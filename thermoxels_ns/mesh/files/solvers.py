@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
@@ -16,7 +15,7 @@ from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
-from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, write_bytes
+from thermoxels_ns.mesh.files.vtu import node_arrays
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
@@ -25,29 +24,20 @@ BODY_GRID, FACET_GRID = "mesh", "facets"
 TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures in .msh files, [degrees Celsius]
 
 _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
-_LONGEST_GMSH_NAME, _LONGEST_INP_NAME = 127, 60  # [bytes], [characters]
 _TRIANGLE, _TETRAHEDRON = 2, 4
 _INT, _DOUBLE = np.dtype("<i4"), np.dtype("<f8")
 _FACE_OPPOSITE: IntArray = np.array([3, 4, 2, 1], dtype=np.int64)
 """Number in .inp files of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
 _ROWS_AT_ONCE = 1 << 15
+_CONDUCTIVITY_W_MK, _DENSITY_KG_M3, _SPECIFIC_HEAT_J_KGK = 1.7, 2200.0, 880.0  # concrete, as in the Thermoxels paper
 _REAL = "%.12E"  # Abaqus reads fields of at most 20 characters
-
-
-def heavy_data_path(path: Path | str) -> Path:
-    """Return the path of the HDF5 file that belongs to an .xdmf file.
-
-    >>> heavy_data_path("house/mesh.xdmf").as_posix()
-    'house/mesh.h5'
-    """
-    return Path(path).with_suffix(".h5")
 
 
 def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell; the grid "facets" holds the boundary triangles with
-    `patch` per triangle. Both hold `temperature_c`, `temperature_k`, `observed` and, if the mesh has colours, `colour`
+    `patch` per triangle. Both hold `temperature_c`, `observed` and, if the mesh has colours, `colour`
     per node. Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists
     the names. In FEniCSx::
 
@@ -62,7 +52,8 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     import h5py
 
     path = Path(path)
-    tags = checked_tags(mesh)
+    mesh.check()
+    tags = mesh.boundary
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,
         "tets": mesh.tets.astype(np.int64),
@@ -71,7 +62,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
         "patch": (tags.patch + 1).astype(np.int32),
         **node_arrays(mesh),
     }
-    data_file = heavy_data_path(path)
+    data_file = path.with_suffix(".h5")
     text = _index(mesh.region_names, tags.patch_names, arrays, escape(data_file.name))
 
     writable_folder(path.parent)
@@ -107,7 +98,7 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
             f'<Topology TopologyType="{kind}" {size}>{data(cells)}</Topology>',
             f'<Geometry GeometryType="XYZ">{data("points_m")}</Geometry>',
             values(tag, "Cell"),  # FEniCSx reads the first attribute of a grid as its tags
-            *(values(one, "Node") for one in ("temperature_c", "temperature_k", "observed", "colour") if one in arrays),
+            *(values(one, "Node") for one in ("temperature_c", "observed", "colour") if one in arrays),
             "</Grid>",
         )
         return "\n".join(lines)
@@ -125,17 +116,10 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     out. Nodal temperatures become a view, `TEMPERATURE_VIEW`. Node k and tetrahedron k of the mesh get the number
     k + 1, and the boundary triangles follow. Layout: "MSH file format version 2", Gmsh reference manual; other than
     version 4 it sorts no nodes by surfaces and volumes. meshio cannot write a patch named like a region.
-
-    Raises:
-        MeshError: A name is too long for Gmsh, or what `TetMesh.check` raises.
     """
     path = Path(path)
-    tags = checked_tags(mesh)
-    for name in (*mesh.region_names, *tags.patch_names):
-        if len(name.encode()) > _LONGEST_GMSH_NAME:
-            expected = f"at most {_LONGEST_GMSH_NAME} bytes, which is what Gmsh reads"
-            got = f"{len(name.encode())} bytes: {name!r}"
-            raise MeshError("name of a region or patch", expected=expected, got=got, remedy="Rename it.")
+    mesh.check()
+    tags = mesh.boundary
     names = [f'2 {number + 1} "{tags.patch_names[number]}"' for number in np.unique(tags.patch).tolist()]
     names += [f'3 {number + 1} "{mesh.region_names[number]}"' for number in np.unique(mesh.region).tolist()]
     nodes, points = len(mesh.points_m), ("point", _DOUBLE, 3)
@@ -151,7 +135,9 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
         # The entries are name, time 0, step 0, number of components and number of nodes.
         head = f'1\n"{TEMPERATURE_VIEW}"\n1\n0.0\n3\n0\n1\n{nodes}\n'
         sections[b"NodeData"] = head.encode() + _numbered(1, ("value", _DOUBLE), mesh.temperature_c)
-    write_bytes(path, (b"$%b\n%b\n$End%b\n" % (name, text, name) for name, text in sections.items()))
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(b"$%b\n%b\n$End%b\n" % (name, text, name) for name, text in sections.items())
 
 
 def _numbered(first: int, field: tuple, values: npt.NDArray) -> bytes:
@@ -169,32 +155,23 @@ def _elements(kind: int, first: int, cells: IntArray, group: IntArray) -> bytes:
     return np.array([kind, len(cells), 2], _INT).tobytes() + _numbered(first, ("row", _INT, rows.shape[1]), rows)
 
 
-@dataclass(frozen=True)
-class HeatStep:
-    """Heat conduction for an .inp file to compute: a body of one material, insulated all round, in equal time steps."""
-
-    conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
-    density_kg_m3: float  # Mass density, [kg / m3], above 0
-    specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
-    steps: int  # Number of steps, at least 1
-    step_seconds: float  # Length of a step, [s], above 0
-
-
-def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
+def write_inp(path: Path | str, mesh: TetMesh, *, steps: int = 10, step_seconds: float = 60.0) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
     Units are metres, kilograms, seconds and degrees Celsius; node k and tetrahedron k get the number k + 1. Contents:
 
     - ``NALL`` and ``EALL``: all nodes and all elements, of type DC3D4, which CalculiX reads as C3D4.
-    - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
+    - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, concrete for all regions.
     - ``PATCH-<name>``: nodes of a boundary patch, and a surface of the same name that holds its element faces.
-    - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
+    - Initial temperatures, and a heat transfer step without boundary conditions, of `steps` equal time steps, that
+      prints temperatures (``NT``).
 
     Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
     and patches are left out, because an empty set stops a solver. Raises `MeshError` if the mesh has no temperatures.
     """
     path = Path(path)
-    tags = checked_tags(mesh)
+    mesh.check()
+    tags = mesh.boundary
     check_start(mesh)
     regions = _set_names("region_names", mesh.region_names)
     patches = _set_names("boundary.patch_names", tags.patch_names)
@@ -205,13 +182,13 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
         file.write("*HEADING\nTetrahedral mesh with measured temperatures; metres, seconds, degrees Celsius\n")
         file.writelines(_nodes_and_elements(mesh, regions))
         file.writelines(_surfaces(mesh, tags, patches, owner, _FACE_OPPOSITE[opposite]))
-        file.writelines(_materials([name for name, _ in _sets(mesh.region, regions)], heat_step))
+        file.writelines(_materials([name for name, _ in _sets(mesh.region, regions)]))
         file.write("*INITIAL CONDITIONS, TYPE=TEMPERATURE\n")
         numbers_from_1 = np.arange(1, len(mesh.points_m) + 1)
         file.writelines(_rows(f"%d, {_REAL}\n", numbers_from_1, mesh.temperature_c))
         # For equal steps, the shortest and the longest step that the solver may take are the length asked for.
-        length, total = _REAL % heat_step.step_seconds, _REAL % (heat_step.steps * heat_step.step_seconds)
-        file.write(f"*STEP, INC={heat_step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n")
+        length, total = _REAL % step_seconds, _REAL % (steps * step_seconds)
+        file.write(f"*STEP, INC={steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n")
         file.write("*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n")
 
 
@@ -223,11 +200,10 @@ def check_start(mesh: TetMesh) -> None:
 
 
 def _set_names(name: str, names: Sequence[str]) -> list[str]:
-    """Return the names as .inp files can hold them; raise `MeshError` if two become equal or one is too long."""
+    """Return the names as .inp files can hold them; raise `MeshError` if two become equal."""
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
-    if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_INP_NAME:
-        expected = "names that differ in their letters and digits (capitals or not), "
-        expected += f"of at most {_LONGEST_INP_NAME} characters, as .inp files ask for"
+    if len(set(written)) != len(written):
+        expected = "names that differ in their letters and digits (capitals or not), as .inp files ask for"
         raise MeshError(name, expected=expected, got=list(names), remedy="Rename them.")
     return written
 
@@ -266,12 +242,12 @@ def _surfaces(mesh: TetMesh, tags: Boundary, patches: Sequence[str], owner: IntA
         yield from _rows("%d, S%d\n", owner[members] + 1, face[members])
 
 
-def _materials(used: Sequence[str], step: HeatStep) -> Iterator[str]:
+def _materials(used: Sequence[str]) -> Iterator[str]:
     yield f"*PHYSICAL CONSTANTS, ABSOLUTE ZERO={-ZERO_CELSIUS_K}, STEFAN BOLTZMANN={STEFAN_BOLTZMANN_W_M2K4:.9E}\n"
     for name in used:
         yield f"*MATERIAL, NAME=MATERIAL-{name}\n"
-        yield f"*DENSITY\n{_REAL}\n" % step.density_kg_m3
-        yield f"*CONDUCTIVITY\n{_REAL}\n" % step.conductivity_w_mk
-        yield f"*SPECIFIC HEAT\n{_REAL}\n" % step.specific_heat_j_kgk
+        yield f"*DENSITY\n{_REAL}\n" % _DENSITY_KG_M3
+        yield f"*CONDUCTIVITY\n{_REAL}\n" % _CONDUCTIVITY_W_MK
+        yield f"*SPECIFIC HEAT\n{_REAL}\n" % _SPECIFIC_HEAT_J_KGK
     for name in used:
         yield f"*SOLID SECTION, ELSET=REGION-{name}, MATERIAL=MATERIAL-{name}\n"

@@ -20,8 +20,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
-from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, default_patches
-from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, nodes_and_triangles
+from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, PatchRules, with_patches
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of, count_wrong_facets, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import (
@@ -32,6 +31,7 @@ from thermoxels_ns.mesh.tetrahedra import (
     facet_area_vectors,
     facet_areas,
     facet_normals,
+    nodes_and_triangles,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 def write_vtu(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K] and `observed` (1: measured, 0: extended)
+    Point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0: extended)
     where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
     `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
 
@@ -110,7 +110,6 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
     `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
     mesh has colours, `colour` as bytes.
-    A mesh without boundary tags is written with one patch, "boundary", and without `seen`, which is unknown.
     """
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
@@ -269,6 +268,17 @@ def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
     return blocks
 
 
+def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
+    """Return arrays per node by name: `temperature_c`, `observed`, and `colour` in bytes, if known."""
+    arrays: dict[str, npt.NDArray] = {}
+    if mesh.has_temperatures:
+        arrays["temperature_c"] = mesh.temperature_c
+        arrays["observed"] = mesh.observed.astype(np.uint8)
+    if mesh.colour is not None:
+        arrays["colour"] = np.floor(np.clip(mesh.colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    return arrays
+
+
 def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
     """Return the tetrahedra with the arrays that `vtu.write_vtu` names."""
     import pyvista as pv
@@ -291,23 +301,22 @@ def boundary_surface(mesh: TetMesh) -> pv.PolyData:
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
 
-    tags, (nodes, triangles) = checked_tags(mesh), nodes_and_triangles(mesh.facets)
+    mesh.check()
+    tags, (nodes, triangles) = mesh.boundary, nodes_and_triangles(mesh.facets)
     arrays: dict[str, npt.NDArray] = {
         "area_m2": facet_areas(mesh.points_m, mesh.facets),
         "normal": facet_normals(mesh.points_m, mesh.facets),
         "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
         "patch": tags.patch + 1,
+        "seen": tags.seen.astype(np.uint8),
     }
-    if mesh.boundary is not None:
-        arrays["seen"] = tags.seen.astype(np.uint8)
     if tags.photographs is not None:
         arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
 
     data = pv.PolyData.from_regular_faces(mesh.points_m[nodes], triangles)
     data.point_data["node"] = nodes
     for name, values in node_arrays(mesh).items():
-        if name != "temperature_k":
-            data.point_data[name] = values[nodes]
+        data.point_data[name] = values[nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
     names = vtkStringArray()  # pyvista's own way takes ASCII names only
@@ -373,8 +382,6 @@ def mesh_of_grid(grid: pv.UnstructuredGrid, up: npt.ArrayLike = (0.0, 0.0, 1.0))
     part = component_of(len(points), facets[:, :2].ravel(), facets[:, 1:].ravel())[facets[:, 0]]
     middle = points[facets].mean(axis=1) - points.mean(axis=0)
     volume = np.einsum("fi,fi->f", middle, facet_area_vectors(points, facets))
-    seen, on_box = np.bincount(part, volume)[part] > 0.0, np.zeros(len(facets), dtype=bool)
-    patch, names = default_patches(facet_normals(points, facets), up, seen, on_box)
     region, region_names = np.zeros(len(tets), np.int64), (DEFAULT_REGION,)
     if "region" in grid.cell_data:
         found = _names(grid, name) if any(key.startswith(_REGION) for key in grid.field_data) else ()
@@ -389,7 +396,9 @@ def mesh_of_grid(grid: pv.UnstructuredGrid, up: npt.ArrayLike = (0.0, 0.0, 1.0))
         region=region,
         region_names=region_names,
     )
-    return _checked(replace(mesh, boundary=Boundary(seen, patch, names)), name, name)
+    seen = np.bincount(part, volume)[part] > 0.0
+    tagged, _ = with_patches(replace(mesh, boundary=replace(mesh.boundary, seen=seen)), PatchRules(), up)
+    return _checked(tagged, name, name)
 
 
 def _check_tetrahedra(grid: Any, name: str) -> None:
@@ -440,8 +449,8 @@ def _names(body: Any, name: str) -> tuple[str, ...]:
     return tuple(numbers[number] for number in range(1, len(numbers) + 1))
 
 
-def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, IntArray, Boundary | None]:
-    """Return triangles (f, 3), their `FACET_BOX` or `FACET_SURFACE`, and tags; None for a mesh written without tags."""
+def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, IntArray, Boundary]:
+    """Return triangles (f, 3), their `FACET_BOX` or `FACET_SURFACE`, and their other tags."""
 
     def array(of: str) -> npt.NDArray:
         return _array(surface.cell_data, of, name)
@@ -456,8 +465,6 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, In
         raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
     facet_tags = np.where(array("on_box") != 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
-    if "seen" not in surface.cell_data and array("patch").dtype.kind != "U":
-        return facets, facet_tags, None
     names = surface.GetFieldData().GetAbstractArray("patch_names")
     if names is None:
         raise _wrong(name, "the field array patch_names", "none")
@@ -469,7 +476,7 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, In
         facets,
         facet_tags,
         Boundary(
-            seen=array("seen") != 0 if "seen" in surface.cell_data else np.ones(len(facets), dtype=bool),
+            seen=array("seen") != 0,
             patch=patch,
             patch_names=patch_names,
             photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,

@@ -1,4 +1,4 @@
-"""Faces, edges and components of a mesh: which elements share them, and how many are missing, wrong or doubled."""
+"""Checks of a mesh: faces, edges and components, how many are missing, wrong or doubled, and figures of its shape."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Node positions of a tetrahedron's faces; face f lies opposite node f, and its right-hand normal points outwards."""
@@ -182,3 +183,54 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
             own = pv.UnstructuredGrid({pv.CellType.TETRA: tets[body == number]}, points)
             found += int(np.count_nonzero(np.atleast_1d(own.find_containing_cell(centres[near])) >= 0))
     return found
+
+
+def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
+    """Return the smallest and the largest angle between two faces of a tetrahedron, [degrees]."""
+    least, most = 1.0, -1.0
+    for _, shapes in shapes_in_chunks(points, tets):
+        cosines = shapes.dihedral_cosines()
+        least, most = min(least, cosines.min()), max(most, cosines.max())
+    return float(np.degrees(np.arccos(most))), float(np.degrees(np.arccos(least)))
+
+
+@dataclass(frozen=True)
+class MeshFigures:
+    """Figures of a sound mesh."""
+
+    volume_m3: float  # sum of the volumes, [m^3]
+    area_m2: float  # sum of the boundary triangles' areas, [m^2]
+    dihedral_range_deg: tuple[float, float]
+    """Smallest and largest angle between two faces of a tetrahedron, [degrees]. The six tetrahedra of a voxel have
+    angles of 45, 60 and 90 degrees, conforming meshes 10.7 to 164.8."""
+    num_non_manifold_edges: int
+    """Number of boundary edges with more than two boundary triangles: a boundary may touch itself, as bodies may."""
+
+
+def check_mesh(mesh: TetMesh) -> MeshFigures:
+    """Return figures of a mesh, lengths in the unit of its nodes; raise if no solver can use the mesh.
+
+    Raises:
+        MeshError: A volume is not above 0, neighbours do not share whole faces, a node belongs to no tetrahedron, two
+            nodes are at one place, or the boundary is not closed; or the arrays do not fit each other or are not
+            finite, see `TetMesh.check`.
+    """
+    mesh.check()
+    points, tets = mesh.points_m, mesh.tets
+    volumes, faces, sides = signed_volumes(points, tets), group_faces(tets), group_sides(mesh.facets)
+    cracks = int(np.count_nonzero(faces.sizes > 2)) + count_overlaps(points, mesh.facets, sides)
+    cracks += count_twin_nodes(points) + len(points) - np.count_nonzero(np.bincount(tets.ravel()))
+    for name, expected, wrong in (
+        ("volumes", "every tetrahedron with a volume above 0", np.count_nonzero(~(volumes > 0.0))),
+        ("conformity", "no crack, no face with three owners, no twin or unused node", cracks),
+        ("boundary", "just the faces with one owner, normals outwards", count_wrong_facets(mesh, faces)),
+    ):
+        if wrong:
+            remedy = "The mesh is damaged: build it again, and report this if it persists."
+            raise MeshError(f"mesh {name}", expected=expected, got=f"{wrong:,} that are wrong", remedy=remedy)
+    return MeshFigures(
+        volume_m3=float(volumes.sum()),
+        area_m2=float(facet_areas(points, mesh.facets).sum()),
+        dihedral_range_deg=dihedral_range_deg(points, tets),
+        num_non_manifold_edges=int(np.count_nonzero(sides.sizes > 2)),
+    )

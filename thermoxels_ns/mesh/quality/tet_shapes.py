@@ -14,9 +14,6 @@ TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
 _CHUNK = 1 << 14  # tetrahedra worked on at a time, so that their data stay in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """For each edge of `TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
-_RIGHT_ANGLE = 1e-6
-"""Angles whose cosine is smaller than this in magnitude count as right angles. In national coordinates, five million
-metres from the origin, nodes have steps of a nanometre, which change cosines in voxels of 1 cm by less than this."""
 _ANGLE_ROUND_OFF = 32.0 * float(np.finfo(np.float64).eps)
 """Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
 
@@ -38,17 +35,13 @@ class TetShapes:
         return self.six_volumes / 6.0
 
     def dihedral_cosines(self) -> FloatArray:
-        """Return the cosines of the dihedral angles at the edges `TET_EDGES`, shape (6, t).
-
-        Angles at a face without area count as 0 degrees. Cosines smaller than `_RIGHT_ANGLE` in magnitude become 0.
-        """
+        """Return the cosines of the dihedral angles at `TET_EDGES`, (6, t); angles at a face without area are 0."""
         lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
         cosines = np.empty((6, len(self.six_volumes)))
         for edge, (i, j) in enumerate(_FACE_PAIRS):
             scale = lengths[i] * lengths[j]
             cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
             cosine[scale == 0.0] = 1.0
-        cosines[np.abs(cosines) < _RIGHT_ANGLE] = 0.0
         return np.clip(cosines, -1.0, 1.0, out=cosines)
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -50,27 +50,21 @@ def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCou
     if len(chosen) > MOST_CAMERAS:
         chosen = np.linspace(0, len(chosen) - 1, MOST_CAMERAS).round().astype(np.int64)
     eyes = lattice.world_to_index(views.camera_to_world[:, :, 3])
-    both = np.zeros(cells.shape, dtype=np.uint16)
+    both = np.zeros((2, *cells.shape), dtype=np.uint8)
     for order in ((0, 1, 2), (1, 0, 2), (2, 0, 1)):
         # The layers across the first axis of `order` are contiguous in memory.
-        passes = np.where(np.ascontiguousarray(cells.transpose(order)), _HELD, _HELD + _FREE)
-        blocks = cells.any(axis=order[1:])
-        counts = np.zeros(passes.shape, dtype=np.uint16)
+        solid = np.ascontiguousarray(cells.transpose(order))
+        counts = np.zeros((2, *solid.shape), dtype=np.uint8)
         for camera in chosen.tolist():
             for sign in (1, -1):
-                _count_along(passes, blocks, counts, views, camera, eyes[camera, list(order)], order, sign)
-        both += counts.transpose(np.argsort(order))
-    return CameraCounts((both % _FREE).astype(np.uint8), (both // _FREE).astype(np.uint8))
-
-
-_HELD, _FREE = np.uint16(1), np.uint16(256)
-"""Units of the two counts, which share one number: `_HELD` for an image that holds a voxel, `_FREE` for a free line."""
+                _count_along(solid, counts, views, camera, eyes[camera, list(order)], order, sign)
+        both += counts.transpose(0, *(1 + np.argsort(order)))
+    return CameraCounts(*both)
 
 
 def _count_along(
-    passes: npt.NDArray[np.uint16],
-    blocks: BoolArray,
-    counts: npt.NDArray[np.uint16],
+    solid: BoolArray,
+    counts: npt.NDArray[np.uint8],
     views: Views,
     camera: int,
     eye: FloatArray,
@@ -78,73 +72,59 @@ def _count_along(
     sign: int,
 ) -> None:
     """Add to `counts` what one camera sees in the pyramid around one half (`sign`) of the axis `order[0]`."""
-    distance = sign * (np.arange(len(passes)) + 0.5 - eye[0])
+    distance = sign * (np.arange(len(solid)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:
         return
     away = distance[ahead]
-    near, far = away[0], away[-1]
-    rays = []
-    for across, centre, voxels in zip(order[1:], eye[1:], passes.shape[1:]):
-        ends = np.array([-centre, voxels - centre])
-        low, high = max(min(ends[0] / near, ends[0] / far), -1.0), min(max(ends[1] / near, ends[1] / far), 1.0)
-        if low >= high:
-            return
-        count = int(np.ceil((high - low) * far))
-        rays.append(_Rays(low, (high - low) / count, count, centre, voxels, owns_diagonal=across > order[0]))
-    u, v = rays
-    direction = np.empty((u.count, v.count, 3))
-    direction[..., order[0]] = sign
-    direction[..., order[1]] = u.slopes[:, None]
-    direction[..., order[2]] = v.slopes
-    held = views.shows(camera, direction)
-    if not held.any():
+    ends = (np.array([[0], [1]]) * solid.shape[1:] - eye[1:])[:, None] / away[[0, -1], None]  # slopes, (2, 2, 2)
+    low, high = np.maximum(ends[0].min(axis=0), -1.0), np.minimum(ends[1].max(axis=0), 1.0)
+    if (low >= high).any():
         return
-    now = np.where(held, _HELD + _FREE, np.uint16(0))
-    ray_u, ray_v, voxel_u, voxel_v = u.of_voxels(away), v.of_voxels(away), u.at_voxels(away), v.at_voxels(away)
-    in_the_way = blocks[ahead] & (away > CLEAR_OF_CAMERA)
-    for step, layer in enumerate(ahead.tolist()):
-        (voxels_u, from_u), (voxels_v, from_v) = ray_u[step], ray_v[step]
-        counts[layer, voxels_u, voxels_v] += now.take(from_u, axis=0).take(from_v, axis=1)
-        if in_the_way[step]:
-            (rays_u, from_u), (rays_v, from_v) = voxel_u[step], voxel_v[step]
-            now[rays_u, rays_v] &= passes[layer].take(from_u, axis=0).take(from_v, axis=1)
+    count = np.ceil((high - low) * away[-1]).astype(np.int64)
+    step = (high - low) / count
+    u, v = (low[axis] + (np.arange(count[axis]) + 0.5) * step[axis] for axis in (0, 1))
+    direction = np.empty((*count, 3))
+    direction[..., order[0]] = sign
+    direction[..., order[1]], direction[..., order[2]] = u[:, None], v
+    held = views.shows(camera, direction)
+    if held.any():
+        # Rays of slope exactly 1 or -1 belong to the pyramid around the lower axis.
+        _follow(solid, held, eye, u, v, low, step, np.greater(order[1:], order[0]), ahead, away, *counts)
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Rays of a pyramid, evenly spaced by their slopes along one axis of the layers."""
+@kernel
+def _follow(solid, held, eye, u, v, low, step, owns, ahead, away, in_image, free):
+    """Follow rays of slopes `u` and `v`, from `low` in steps of `step`, through layers `ahead` at distances `away`.
 
-    low: float  # lowest slope
-    step: float  # difference of the slopes of neighbours
-    count: int  # number of rays
-    eye: float  # position of the camera along the axis, [voxels]
-    voxels: int  # number of voxels along the axis
-    owns_diagonal: bool  # True: rays of slope exactly 1 or -1 belong to this pyramid; False: to its neighbour
-
-    @property
-    def slopes(self) -> FloatArray:
-        return self.low + (np.arange(self.count) + 0.5) * self.step
-
-    def of_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
-        """Return, per layer at distance `away`, the run of voxels in the pyramid and the number of each one's ray."""
-        slope = (np.arange(self.voxels) + 0.5 - self.eye) / away[:, None]
-        number = np.clip(np.floor((slope - self.low) / self.step), -1, self.count).astype(np.int64)
-        if self.owns_diagonal:
-            number[slope == 1.0] = self.count - 1
-        else:
-            number[slope == -1.0] = -1
-        return _runs(number, self.count)
-
-    def at_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
-        """Return, per layer at distance `away`, the run of rays in the layer and the number of each one's voxel."""
-        return _runs(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
-
-
-def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
-    """Return for each row of ascending numbers the slice of entries from 0 to `count` - 1, and these entries."""
-    starts, stops = ((number < end).sum(axis=1).tolist() for end in (0, count))
-    return [(slice(a, b), row[a:b]) for row, a, b in zip(number, starts, stops)]
+    Adds one to `in_image` for each voxel whose ray the image holds (`held`), and to `free` where nothing solid blocks
+    the ray. `owns` says for both axes whether rays of slope 1 or -1 belong to this pyramid.
+    """
+    clear, (_, num_u, num_v) = held.copy(), solid.shape
+    ray_of_u, ray_of_v = np.empty(num_u, np.int64), np.empty(num_v, np.int64)
+    for layer, distance in zip(ahead, away):
+        for axis, ray_of, rays in ((0, ray_of_u, len(u)), (1, ray_of_v, len(v))):
+            for n in range(len(ray_of)):
+                slope = (n + 0.5 - eye[axis + 1]) / distance
+                ray = max(-1.0, min(np.floor((slope - low[axis]) / step[axis]), float(rays)))
+                if owns[axis] and slope == 1.0:
+                    ray = rays - 1.0
+                outside = ray == rays or (slope == -1.0 and not owns[axis])
+                ray_of[n] = -1 if outside else ray
+        inside_v = np.flatnonzero(ray_of_v >= 0)
+        for i in np.flatnonzero(ray_of_u >= 0):
+            for j in inside_v:
+                if held[ray_of_u[i], ray_of_v[j]]:
+                    in_image[layer, i, j] += 1
+                    free[layer, i, j] += clear[ray_of_u[i], ray_of_v[j]]
+        if distance > CLEAR_OF_CAMERA and solid[layer].any():
+            rows = np.floor(eye[1] + u * distance).astype(np.int64)
+            columns = np.floor(eye[2] + v * distance).astype(np.int64)
+            inside_v = np.flatnonzero((columns >= 0) & (columns < num_v))
+            for a in np.flatnonzero((rows >= 0) & (rows < num_u)):
+                for b in inside_v:
+                    if solid[layer, rows[a], columns[b]]:
+                        clear[a, b] = False
 
 
 def first_solid(

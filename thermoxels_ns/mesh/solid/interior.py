@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -29,26 +28,17 @@ THINNEST_GROWN = 1.5
 """Least thickness of a wall that gets voxels behind the seen one, [voxels]: the next voxel's middle is this deep."""
 
 
-@dataclass(frozen=True)
-class Interior:
-    """The empty voxels that lie inside a solid."""
-
-    inside: BoolArray
-    """Voxels of cavities that have no way out through voxel faces and no camera in them, and voxels that no camera
-    sees, behind the surface and within the convex hull of a body."""
-    rooms: int  # cavities left empty because a camera stands in them
-
-
 def interior(
     cells: BoolArray, lattice: Lattice, views: Views | None, seal: int, within: BoolArray | None = None
-) -> Interior:
+) -> BoolArray:
     """Return the empty voxels inside bodies of which only a shell was reconstructed; `cells` are the shell's voxels.
 
     Only voxels `within` a region are returned; solid outside the region still blocks the view. Voxels are one body if
-    they touch after openings of up to twice `seal` voxels are closed. Inside are the cavities of this sealed shell and,
-    if the cameras are known, voxels in the body's convex hull that lie in a camera's image, are hidden by the shell
-    (`count_cameras`) and surrounded by the backs of seen surfaces (`winding_number`). A second pass takes the voxels
-    found as solid and adds crevices that these hide, where surfaces surround them well (`CREVICE_SURROUNDED`).
+    they touch after openings of up to twice `seal` voxels are closed. Inside are the cavities of this sealed shell that
+    have no way out through voxel faces and no camera in them and, if the cameras are known, voxels in the body's convex
+    hull that lie in a camera's image, are hidden by the shell (`count_cameras`) and surrounded by the backs of seen
+    surfaces (`winding_number`). A second pass takes the voxels found as solid and adds crevices that these hide, where
+    surfaces surround them well (`CREVICE_SURROUNDED`).
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     inside, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -56,7 +46,7 @@ def interior(
         inside |= _hidden(sealed, within, lattice, views, seal) & ~cells
         # Cavities that the filled space encloses are inside as well.
         inside |= cavities(cells | inside, room | camera_voxels(cells, lattice, views))[0]
-    return Interior(inside & within, int(face_connected(room).max()) if room.any() else 0)
+    return inside & within
 
 
 def _enclosed(

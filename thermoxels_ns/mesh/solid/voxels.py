@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
@@ -95,7 +94,6 @@ class SolidCells:
     dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     steps: tuple[SolidStep, ...]  # all in order; the first is the threshold, which says what rule chose it and why
-    component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
     rooms: BoolArray | None  # True for empty voxels inside hollow walls of given thickness; None for other solids
@@ -104,20 +102,23 @@ class SolidCells:
 def select_solid(
     snapshot: GridSnapshot,
     selection: SolidSelection,
-    metres_per_world_unit: float | None = None,
+    metres_per_world_unit: float = 1.0,
     world_to_input: FloatArray | None = None,
 ) -> SolidCells:
     """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
-    `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
-    to those of the region's box or point; None is the identity.
+    `metres_per_world_unit` is used for a wall thickness only, which also needs the cameras. `world_to_input`, shape
+    (3, 4), maps world coordinates to those of the region's box or point; None is the identity.
 
     Raises:
         MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
-            voxels have one density; or the wall thickness cannot be made: the scale or the cameras are not known, or
-            the wall is thicker than the scene box.
+            voxels have one density; or the wall is thicker than the scene box.
     """
-    thickness = _wall_voxels(snapshot, selection, metres_per_world_unit)
+    voxel_m = metres_per_world_unit * snapshot.lattice.voxel_size
+    wall_m, longest_m = selection.wall_thickness, max(snapshot.lattice.cell_shape) * voxel_m
+    if wall_m is not None and wall_m > longest_m:
+        expected, remedy = f"at most the scene box, {longest_m:.3g} m", "Pass metres, and check --metres-per-unit."
+        raise MeshError("wall_thickness", expected=expected, got=f"{wall_m:g} m", remedy=remedy)
     density = snapshot.centre_density()
     chosen = dense_voxels(snapshot, density, selection)
     if not chosen.cells.any():
@@ -147,61 +148,34 @@ def select_solid(
     left_out = everything & ~cells
     # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
     opaque, rooms = cells | (everything & ~within), None
-    if thickness is not None:
-        assert snapshot.views is not None
+    if wall_m is not None:
+        assert snapshot.views is not None, "the side that is seen is that of the cameras"
+        thickness = wall_m / voxel_m
         wall = cells | (wall_behind(opaque, snapshot.lattice, snapshot.views, thickness) & within)
-        asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
+        asked = f"{wall_m:g} m thick ({thickness:.3g} voxels)"
         remark = f"The seen surface is made {asked}."
         if thickness < THINNEST_GROWN:
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
         if selection.interior == "hollow":
-            found = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within)
-            rooms = found.inside & ~cells
+            rooms = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within) & ~cells
             depth = np.asarray(ndimage.distance_transform_edt(cells | rooms | ~within))
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
     elif selection.interior == "solid":
-        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
-        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
-        if found.rooms:
-            remark += f" {found.rooms} cavities with a camera in them stay empty."
-        cells = step("interior", cells | found.inside, remark)
+        inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = "Cavities without a camera are filled, and what cameras cannot look into within the hull of a body."
+        cells = step("interior", cells | inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
         threshold=chosen.density,
         steps=tuple(steps),
-        component_sizes=np.sort(sizes)[::-1].astype(np.int64),
         within=within,
         left_out=left_out,
         rooms=rooms,
     )
-
-
-def _wall_voxels(
-    snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None
-) -> float | None:
-    """Return the wall thickness, [voxels], or None if none is asked for; raise `MeshError` if it cannot be made."""
-    thickness = selection.wall_thickness
-    if thickness is None:
-        return None
-    if metres_per_world_unit is None:
-        remedy = "Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness."
-        got = f"{thickness:g} m, but no length of a unit"
-        raise MeshError("wall_thickness", expected="a scene whose scale is known", got=got, remedy=remedy)
-    check_positive("metres_per_world_unit", metres_per_world_unit, "Pass --metres-per-unit.", MeshError)
-    if snapshot.views is None or len(snapshot.views.focal) == 0:
-        expected = "training cameras, which tell the side that is seen"
-        remedy = "Export from a trained scene, or leave out --wall-thickness."
-        raise MeshError("wall_thickness", expected=expected, got="a field without cameras", remedy=remedy)
-    voxel_m = metres_per_world_unit * snapshot.lattice.voxel_size
-    longest = max(snapshot.lattice.cell_shape) * voxel_m
-    if thickness > longest:
-        remedy, expected = "Pass it in metres, and check --metres-per-unit.", f"at most the scene box, {longest:.3g} m"
-        raise MeshError("wall_thickness", expected=expected, got=f"{thickness:g} m", remedy=remedy)
-    return thickness / voxel_m
 
 
 @dataclass(frozen=True)
@@ -252,22 +226,16 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
-    cells = dense = density >= np.float32(threshold)
+    cells = density >= np.float32(threshold)
     if evidence.voxel_ends is not None:
         passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
-        cells = dense & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
-    held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
+        cells &= ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     share = float(np.mean(met >= np.float32(threshold)))
-    bound = {low: ", the least that is not half-transparent", high: ", the most that is asked"}.get(threshold, "")
-    count, left_out = np.count_nonzero(dense) - np.count_nonzero(cells), ""
-    if count:
-        left_out = f"{count} voxels that dense are left out: hardly any ray ends in them and they are not opaque. "
     return Threshold(
         cells,
         threshold,
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
-        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
-        f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
+        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel).",
     )
 
 

@@ -2,20 +2,16 @@ import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
-import meshio
 import numpy as np
 import pytest
 import trimesh
 
-from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.files.content import checked_tags, nodes_and_triangles
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
-from thermoxels_ns.mesh.files.solvers import HeatStep
-from thermoxels_ns.mesh.files.surface import write_glb, write_ply, write_stl
+from thermoxels_ns.mesh.files.glb import write_glb
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.tetrahedra import facet_normals
+from thermoxels_ns.mesh.tetrahedra import nodes_and_triangles
 
-STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 SUFFIXES = sorted(MESH_FORMATS)
 
 
@@ -43,15 +39,14 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
 def test_a_damaged_mesh_is_refused(tagged_mesh, field, change):
     damaged = dataclasses.replace(tagged_mesh, **{field: change(getattr(tagged_mesh, field))})
     with pytest.raises(MeshError, match=f"^mesh {field}: expected"):
-        checked_tags(damaged)
+        damaged.check()
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_writes_the_files_that_it_names_and_the_same_bytes_again(tmp_path, tagged_mesh, box_mesh, suffix):
-    write_mesh(tmp_path / f"untagged{suffix}", box_mesh, heat_step=STEP)
+def test_every_format_writes_the_files_that_it_names_and_the_same_bytes_again(tmp_path, tagged_mesh, suffix):
     path, again = (tmp_path / folder / f"house{suffix}" for folder in ("new folder", "another"))
     for file in (path, again):
-        write_mesh(file, tagged_mesh, heat_step=STEP)
+        write_mesh(file, tagged_mesh)
     assert {path, *mesh_file_paths(path)} == set(path.parent.iterdir())
     assert all(file.stat().st_size for file in mesh_file_paths(path))
     for first, second in zip(mesh_file_paths(path), mesh_file_paths(again)):
@@ -65,65 +60,9 @@ def test_a_mesh_that_is_refused_leaves_the_old_files(tmp_path, tagged_mesh, suff
         file.write_text("old")
     damaged = dataclasses.replace(tagged_mesh, points_m=changed(tagged_mesh.points_m, np.nan))
     with pytest.raises(MeshError, match="points_m"):
-        write_mesh(path, damaged, heat_step=STEP)
+        write_mesh(path, damaged)
     assert {file.read_text() for file in tmp_path.iterdir()} == {"old"}
     assert set(tmp_path.iterdir()) == set(mesh_file_paths(path))
-
-
-def test_formats_are_found_by_their_ending():
-    assert set(MESH_FORMATS) == {".vtu", ".xdmf", ".msh", ".inp", ".stl", ".ply", ".glb"}
-    assert mesh_file_paths("a.b.msh") == [Path("a.b.msh")]
-    with pytest.raises(OutputError, match=r"one of \.vtu, .*got house\.obj"):
-        mesh_file_paths("house.obj")
-
-
-def colours(read: meshio.Mesh) -> np.ndarray:
-    """Red, green, blue from 0 to 255; meshio reads bytes with a sign."""
-    return np.stack([read.point_data[name].view(np.uint8) for name in ("red", "green", "blue")], axis=1).astype(float)
-
-
-def test_stl_is_the_closed_surface(tmp_path, tagged_mesh):
-    write_stl(tmp_path / "house.stl", tagged_mesh)
-    read = trimesh.load_mesh(tmp_path / "house.stl")
-    assert read.is_watertight
-    assert read.volume == pytest.approx(signed_volumes(tagged_mesh.points_m, tagged_mesh.tets).sum(), rel=1e-5)
-    assert read.triangles == pytest.approx(tagged_mesh.points_m[tagged_mesh.facets], abs=1e-6)
-    # Behind the header, each triangle starts with its normal.
-    raw = np.frombuffer((tmp_path / "house.stl").read_bytes(), dtype=np.uint8)[84:].reshape(-1, 50)
-    normals = raw[:, :12].copy().view("<f4")
-    assert normals == pytest.approx(facet_normals(tagged_mesh.points_m, tagged_mesh.facets), abs=1e-6)
-
-
-@pytest.mark.parametrize("suffix", [".stl", ".ply"])
-def test_single_precision_far_from_the_origin_is_refused(tmp_path, tagged_mesh, suffix):
-    """At five million metres single precision has steps of half a metre, wider than the triangles."""
-    far = replace(tagged_mesh, points_m=tagged_mesh.points_m + np.array([450_000.3, 5_200_000.4, 300.0]))
-    with pytest.raises(MeshError, match=r"^mesh for \.stl or \.ply: .*Write \.glb"):
-        write_mesh(tmp_path / f"far{suffix}", far)
-    assert not list(tmp_path.iterdir())
-
-
-def test_ply_holds_colours_of_the_photographs_and_temperatures(tmp_path, tagged_mesh):
-    write_ply(tmp_path / "house.ply", tagged_mesh)
-    read = meshio.read(tmp_path / "house.ply")
-    nodes, _ = nodes_and_triangles(tagged_mesh.facets)
-    assert np.array_equal(read.points, tagged_mesh.points_m[nodes].astype(np.float32))
-    assert np.array_equal(nodes[read.cells_dict["triangle"]], tagged_mesh.facets)
-    assert read.point_data["temperature_c"] == pytest.approx(tagged_mesh.temperature_c[nodes], rel=1e-6)
-    assert np.array_equal(read.point_data["observed"], tagged_mesh.observed[nodes])
-    rgb = colours(read)
-    assert np.abs(rgb / 255.0 - tagged_mesh.colour[nodes]).max() <= 0.5 / 255.0 + 1e-6
-
-
-def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
-    write_ply(tmp_path / "box.ply", box_mesh)
-    read = meshio.read(tmp_path / "box.ply")
-    rgb = colours(read)
-    # Inferno grows brighter from cold to hot throughout.
-    brightness = rgb @ [0.2126, 0.7152, 0.0722]
-    order = np.argsort(read.point_data["temperature_c"])
-    assert np.all(np.diff(brightness[order]) > -1.0)
-    assert brightness[order[-1]] > 4.0 * brightness[order[0]]
 
 
 def read_glb(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
