@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
-from lxml import etree
 from PIL import Image, ImageFile
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
