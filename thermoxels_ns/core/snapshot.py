@@ -28,11 +28,11 @@ def as_pinholes(
     return np.where(fisheye[:, None], before, centre), np.where(fisheye[:, None], wide, size)
 
 
-SHOWN_WELL = 0.15
-"""Least visibility of a place that is shown well, relative to what cameras were pointed at. In nine synthetic scenes
-with a street or room around, this keeps all of the scene and removes half of what is around; in synthetic rooms seen
-from inside it keeps 99.7 % of what two photographs see."""
-_FEWEST_CAMERAS = 0.1  # Quantile of the visibility of what cameras are pointed at; `SHOWN_WELL` refers to it
+SHOWN_WELL = 0.25
+"""Least precision of a place that is shown well, relative to what cameras were pointed at: standard errors are at most
+twice as large."""
+_FEWEST_CAMERAS = 0.1  # Quantile of the precision of what cameras are pointed at; `SHOWN_WELL` refers to it
+_NO_PARALLAX = 1e-7  # Precision per camera below which cameras stand at one place: angles of 0.02 degrees
 
 
 @dataclass(frozen=True)
@@ -64,26 +64,33 @@ class Views:
     def shown_well(self, places: FloatArray, reach: FloatArray) -> BoolArray:
         """Return which places (n, 3) photographs show about as well as what the cameras were pointed at, (n,).
 
-        Each camera adds 1 to the visibility of all places in its image up to the distance `reach` of what it was
-        pointed at, and (reach / distance)^2 beyond, in proportion to the pixels per area; occlusion is ignored. A place
-        is shown well if its visibility is at least `SHOWN_WELL` of that of the places which nearly all cameras were
-        pointed at. Open ground then ends about where the cameras stood. Cameras whose `reach` (cameras,) is NaN do not
-        count; if none counts, all places are shown well.
+        A place is shown well if the position of a point there, as photographs fix it by parallax, is at least
+        `SHOWN_WELL` times as precise as that of the places which nearly all cameras were pointed at. A camera that has
+        the place in its image at the distance z, in the direction d, adds the information (I - d d^T) (r / z)^2: a
+        pixel tells nothing along its ray, and across it the less the larger the pixel is there (least squares of
+        intersecting rays). r is the distance of what the camera was pointed at, its `reach` (cameras,); nearer places
+        count as being there. Precision is the least eigenvalue of the sum. Occlusion is ignored. Open ground then ends
+        about where the cameras stood, and so does what stands far behind an object photographed from one side. Cameras
+        whose `reach` is NaN do not count; if none counts, or all stand at one place, all places are shown well.
         """
         (known,) = np.nonzero(np.isfinite(reach))
         eyes, axes = self.camera_to_world[:, :, 3], self.camera_to_world[:, :, 2]
         aims = (eyes - (1.0 - 1e-6) * reach[:, None] * axes)[known]
 
-        def visibility(at: FloatArray) -> FloatArray:
-            total = np.zeros(len(at))
+        def precision(at: FloatArray) -> FloatArray:
+            total = np.zeros((len(at), 3, 3))
             for camera in known.tolist():
                 away = at - eyes[camera]
-                nearness = reach[camera] ** 2 / np.maximum((away**2).sum(axis=1), 1e-12)
-                total += self.shows(camera, away) * np.minimum(1.0, nearness)
-            return total
+                (seen,) = np.nonzero(self.shows(camera, away))
+                along = away[seen]
+                square = np.maximum((along**2).sum(axis=1), 1e-12)
+                weight = np.minimum(1.0, reach[camera] ** 2 / square)
+                along *= np.sqrt(weight / square)[:, None]
+                total[seen] += weight[:, None, None] * np.eye(3) - along[:, :, None] * along[:, None, :]
+            return np.linalg.eigvalsh(total)[:, 0]
 
-        least = float(np.quantile(visibility(aims), _FEWEST_CAMERAS)) if len(known) else 0.0
-        return visibility(places) >= SHOWN_WELL * least
+        least = float(np.quantile(precision(aims), _FEWEST_CAMERAS)) if len(known) else 0.0
+        return precision(places) >= (SHOWN_WELL * least if least > _NO_PARALLAX * len(known) else -np.inf)
 
 
 @dataclass(frozen=True)
