@@ -19,6 +19,7 @@ from thermoxels_ns.core.yaml_records import record, wrong
 from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
+from thermoxels_ns.mesh.solid.ray_ends import ends_in_voxels, without_front
 
 RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
@@ -81,7 +82,7 @@ class SolidSelection:
 class SolidStep:
     """The changes made by one of the steps that lead from density to solid voxels."""
 
-    name: str  # threshold, close gaps, region, wall or interior
+    name: str  # threshold, close gaps, region, interior, surface, wall or close rooms
     added: int  # number of voxels that the step made solid
     removed: int  # number of voxels that the step made empty
     remark: str  # one or two sentences on how and why
@@ -147,6 +148,17 @@ def select_solid(
     left_out = everything & ~cells
     # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
     opaque, rooms = cells | (everything & ~within), None
+    if thickness is None and selection.interior == "solid":
+        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
+        if found.rooms:
+            remark += f" {found.rooms} cavities with a camera in them stay empty."
+        cells = step("interior", cells | found.inside, remark)
+    if chosen.by_rays:
+        assert snapshot.evidence is not None
+        remark = "Voxels with their centres in front of where rays end go, unless a ray then meets no solid."
+        cells = step("surface", without_front(cells, snapshot.evidence), remark)
+        opaque = cells | (everything & ~within)
     if thickness is not None:
         assert snapshot.views is not None
         wall = cells | (wall_behind(opaque, snapshot.lattice, snapshot.views, thickness) & within)
@@ -162,12 +174,6 @@ def select_solid(
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
-    elif selection.interior == "solid":
-        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
-        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
-        if found.rooms:
-            remark += f" {found.rooms} cavities with a camera in them stay empty."
-        cells = step("interior", cells | found.inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
@@ -211,6 +217,7 @@ class Threshold:
     cells: BoolArray  # True where a voxel is dense enough and rays do not rule it out, shape `lattice.cell_shape`
     density: float  # least density at the centre of a voxel that is dense enough, [1 / world unit]
     explanation: str  # one or two sentences on which rule chose the threshold, and why
+    by_rays: bool = False  # True if training rays chose the threshold, and it is known where they end
 
 
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
@@ -246,15 +253,16 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
 
     Voxels where rays spend weight but hardly any ray ends hold density from light that leaked past a surface. A few of
     these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`. Without
-    `RayEvidence.voxel_ends` all voxels that reach the threshold are chosen.
+    `RayEvidence.ends` all voxels that reach the threshold are chosen.
     """
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
     cells = dense = density >= np.float32(threshold)
-    if evidence.voxel_ends is not None:
-        passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
+    if evidence.ends is not None:
+        ends = ends_in_voxels(evidence, density.shape)
+        passed = (ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
         cells = dense & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
     share = float(np.mean(met >= np.float32(threshold)))
@@ -268,6 +276,7 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
         f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
         f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
+        by_rays=evidence.ends is not None,
     )
 
 
