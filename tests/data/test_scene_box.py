@@ -158,7 +158,7 @@ def test_fisheye_lenses_see_to_their_sides(tmp_path):
         for x, y in ((1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (-0.7, 0.7))
     ]
     box = box_of_points(walls, frames)
-    assert (box[0] < [-1.0, -1.9, -1.9]).all() and (box[1] > 1.9).all(), box
+    assert (box[0] < [-1.9, -1.0, -1.9]).all() and (box[1] > 1.9).all(), box
 
 
 def test_points_near_the_edges_of_photographs_alone_and_a_blind_camera_give_a_box(tmp_path):
