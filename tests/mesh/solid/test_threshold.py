@@ -41,7 +41,7 @@ def field(
     if ends is not None:
         counts = ends.astype(np.int64).ravel()
         middles = np.stack(np.unravel_index(np.repeat(np.arange(counts.size), counts), ends.shape), axis=1) + 0.5
-        of_rays = [middles.astype(np.float32), np.tile(np.float32([0.0, 0.0, -1.0]), (len(middles), 1))]
+        of_rays = [middles.astype(np.float32), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(middles), 1))]
     evidence = RayEvidence(weight.astype(np.float32), met.astype(np.float32), *of_rays)
     density = voxel_density.astype(np.float32)
     return GridSnapshot(lattice, zero, zero, zero, voxel_density=density, evidence=evidence)
