@@ -484,9 +484,10 @@ class ThermoxelsModel(Model):
             channels = torch.sigmoid(mean).float().unbind(-1)
             colour = torch.stack([grid.corner_values(rows, 0.5) for rows in channels], -1).cpu().numpy()
         if seen.rays:
-            cells = np.zeros((2, *grid.lattice.cell_shape), dtype=np.float32)
-            cells.reshape(2, -1)[:, grid.voxels.cells] = torch.stack((seen.voxel_weight, seen.voxel_ends)).cpu()
-            evidence = RayEvidence(cells[0], seen.half_depth_density.float().cpu().numpy(), cells[1])
+            weight = np.zeros(grid.lattice.cell_shape, dtype=np.float32)
+            weight.reshape(-1)[grid.voxels.cells] = seen.voxel_weight.cpu()
+            of_rays = seen.half_depth_density, seen.ends, seen.directions
+            evidence = RayEvidence(weight, *(values.float().cpu().numpy() for values in of_rays))
         return GridSnapshot(
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),

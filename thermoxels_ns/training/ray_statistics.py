@@ -98,12 +98,13 @@ class FieldEvidence:
     thermal_weight: Float[Tensor, " rows"]
     """Sum of the weights of the first-hit samples around each corner, shared out by trilinear weights, [rays]."""
     voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights of all rays in each kept voxel, [rays]
-    voxel_ends: Float[Tensor, " voxels"]
-    """Number of rays that end on something (opacity above one half) and complete half of their weight in each kept
-    voxel, [rays]."""
+    ends: Float[Tensor, "ends 3"]
+    """Points at which the rays that end on something (opacity above one half) complete half of their weight, in corner
+    indices, in the order of the rays."""
+    directions: Float[Tensor, "ends 3"]  # Unit vectors of these rays
     half_depth_density: Float[Tensor, " ends"]
-    """One density per ray of opacity above one half, in the order of the rays, [1 / world unit]: the highest at the
-    centres of the voxels that the ray crosses within `END_WIDTH` of the sample that completes half of its weight."""
+    """One density for each of these rays, [1 / world unit]: the highest at the centres of the voxels that the ray
+    crosses within `END_WIDTH` of its end."""
 
 
 @torch.no_grad()
@@ -119,7 +120,7 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
     centre_density = grid.voxel_density()
     corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
     voxels = torch.zeros(len(grid.voxels), dtype=torch.float64, device=device)
-    ends = torch.zeros_like(voxels)
+    ends, along = [corners.new_zeros(0, 3)], [corners.new_zeros(0, 3)]
     half_depth = [centre_density.view(-1)[:0]]
     seen = 0
     for bundle, directions, samples in _sampled(grid, sample, rays):
@@ -127,7 +128,9 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
         at_half, ray = samples.at.select(half_way), samples.ray[half_way]
-        ends += torch.bincount(at_half.number, minlength=len(ends))
+        place = torch.stack(torch.unravel_index(grid.cells[at_half.number], grid.lattice.cell_shape), -1)
+        ends.append((place + at_half.fraction).to(corners.dtype))
+        along.append(directions[ray].to(corners.dtype))
         half_depth.append(_density_met(grid, centre_density, at_half, directions[ray]))
         stream = bundle.metadata.get("stream")
         ends_here = samples.transmittance < 0.5
@@ -141,7 +144,8 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
     weight = corners[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
-    return FieldEvidence(seen, thermal.clamp(0, 1), weight, voxels, ends, torch.cat(half_depth))
+    of_rays = torch.cat(ends), torch.cat(along), torch.cat(half_depth)
+    return FieldEvidence(seen, thermal.clamp(0, 1), weight, voxels, *of_rays)
 
 
 def _density_met(

@@ -30,12 +30,19 @@ MET = np.repeat(np.arange(1.0, 11.0), [30, 130, *[105] * 8])
 def field(
     voxel_density: np.ndarray, met: np.ndarray, weight: np.ndarray | None = None, ends: np.ndarray | None = None
 ) -> GridSnapshot:
-    """A field with the given voxels, and rays that meet the given densities where they end."""
+    """A field with the given voxels, and rays that meet the given densities where they end.
+
+    `ends` counts the rays that end in the middle of each voxel, downwards; None: not known.
+    """
     lattice = Lattice((0.0, 0.0, 0.0), VOXEL, tuple(n + 1 for n in voxel_density.shape))  # type: ignore[arg-type]
     weight = np.ones_like(voxel_density) if weight is None else weight
     zero = np.zeros(lattice.shape, dtype=np.float32)
-    ends = None if ends is None else ends.astype(np.float32)
-    evidence = RayEvidence(weight.astype(np.float32), met.astype(np.float32), ends)
+    of_rays: list[np.ndarray] = []
+    if ends is not None:
+        counts = ends.astype(np.int64).ravel()
+        middles = np.stack(np.unravel_index(np.repeat(np.arange(counts.size), counts), ends.shape), axis=1) + 0.5
+        of_rays = [middles.astype(np.float32), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(middles), 1))]
+    evidence = RayEvidence(weight.astype(np.float32), met.astype(np.float32), *of_rays)
     density = voxel_density.astype(np.float32)
     return GridSnapshot(lattice, zero, zero, zero, voxel_density=density, evidence=evidence)
 
@@ -93,7 +100,7 @@ def test_a_few_dense_voxels_behind_a_surface_do_not_widen_the_body():
     whole = field(density, MET, weight, ends)
     assert whole.evidence is not None
     assert not select_solid(whole, SolidSelection(region="all")).cells[:, :, :5].any()
-    blind = replace(whole, evidence=replace(whole.evidence, voxel_ends=None))
+    blind = replace(whole, evidence=replace(whole.evidence, ends=None, directions=None))
     assert select_solid(blind, SolidSelection(region="all")).cells[:, :, 3].any()
 
 
@@ -142,9 +149,10 @@ class Layers:
         seen = field_evidence(
             self.grid, self.sample_rays, [RayBundle(origins, directions, torch.ones(len(origins), 1))]
         )
-        weight, ends = (v.view(LAYERS.cell_shape).float().numpy() for v in (seen.voxel_weight, seen.voxel_ends))
+        weight = seen.voxel_weight.view(LAYERS.cell_shape).float().numpy()
         zero = np.zeros(LAYERS.shape, np.float32)
-        evidence = RayEvidence(weight, seen.half_depth_density.numpy(), ends)
+        of_rays = (values.numpy() for values in (seen.half_depth_density, seen.ends, seen.directions))
+        evidence = RayEvidence(weight, *of_rays)
         density = self.grid.voxel_density().numpy()
         return GridSnapshot(LAYERS, zero, zero, zero, voxel_density=density, evidence=evidence)
 

@@ -18,6 +18,7 @@ from thermoxels_ns.core.yaml_records import record, wrong
 from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
+from thermoxels_ns.mesh.solid.ray_ends import ends_in_voxels, without_front
 
 RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
@@ -43,7 +44,7 @@ FEWEST_RAYS = 100  # least number of rays that end on something for the threshol
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
 SEAL = 2  # to find the interior, openings up to twice this many voxels wide count as closed
-MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
+MOST_BLOCKS = 100_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
 @record(MeshError)
@@ -80,7 +81,7 @@ class SolidSelection:
 class SolidStep:
     """The changes made by one of the steps that lead from density to solid voxels."""
 
-    name: str  # threshold, close gaps, region, wall or interior
+    name: str  # threshold, close gaps, region, interior, surface, wall or close rooms
     added: int  # number of voxels that the step made solid
     removed: int  # number of voxels that the step made empty
     remark: str  # one or two sentences on how and why
@@ -148,6 +149,15 @@ def select_solid(
     left_out = everything & ~cells
     # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
     opaque, rooms = cells | (everything & ~within), None
+    if wall_m is None and selection.interior == "solid":
+        inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = "Cavities without a camera are filled, and what cameras cannot look into within the hull of a body."
+        cells = step("interior", cells | inside, remark)
+    if chosen.by_rays:
+        assert snapshot.evidence is not None
+        remark = "Voxels with their centres in front of where rays end go, unless a ray then meets no solid."
+        cells = step("surface", without_front(cells, snapshot.evidence), remark)
+        opaque = cells | (everything & ~within)
     if wall_m is not None:
         assert snapshot.views is not None, "the side that is seen is that of the cameras"
         thickness = wall_m / voxel_m
@@ -163,10 +173,6 @@ def select_solid(
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
-    elif selection.interior == "solid":
-        inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
-        remark = "Cavities without a camera are filled, and what cameras cannot look into within the hull of a body."
-        cells = step("interior", cells | inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
@@ -185,6 +191,7 @@ class Threshold:
     cells: BoolArray  # True where a voxel is dense enough and rays do not rule it out, shape `lattice.cell_shape`
     density: float  # least density at the centre of a voxel that is dense enough, [1 / world unit]
     explanation: str  # one or two sentences on which rule chose the threshold, and why
+    by_rays: bool = False  # True if training rays chose the threshold, and it is known where they end
 
 
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
@@ -220,15 +227,15 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
 
     Voxels where rays spend weight but hardly any ray ends hold density from light that leaked past a surface. A few of
     these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`. Without
-    `RayEvidence.voxel_ends` all voxels that reach the threshold are chosen.
+    `RayEvidence.ends` all voxels that reach the threshold are chosen.
     """
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
     cells = density >= np.float32(threshold)
-    if evidence.voxel_ends is not None:
-        passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
+    if evidence.ends is not None:
+        passed = (ends_in_voxels(evidence, density.shape) <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
         cells &= ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     share = float(np.mean(met >= np.float32(threshold)))
     return Threshold(
@@ -236,6 +243,7 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
         threshold,
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
         f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel).",
+        by_rays=evidence.ends is not None,
     )
 
 
