@@ -20,8 +20,8 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
         (128.0, (32, 64, 128)),
         (160.0, (40, 80, 160)),
         (220.0, (56, 112, 224)),
-        (230.0, (32, 64, 128, 256)),
-        (5000.0, (48, 96, 192, 384)),
+        (230.0, (64, 128, 256)),
+        (5000.0, (96, 192, 384)),
         (1.0, (8, 16, 32)),
         (math.inf, (32, 64, 128)),
     ],
@@ -37,7 +37,7 @@ def test_resolutions_follow_the_photographs_up_to_a_limit(voxels, expected):
 
 
 @pytest.mark.parametrize(
-    ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (48, 96, 192, 384)), (None, (32, 64, 128))]
+    ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (96, 192, 384)), (None, (32, 64, 128))]
 )
 def test_a_model_has_the_voxels_that_its_photographs_ask_for(pixel_size, expected):
     metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}

@@ -14,9 +14,9 @@ _REFINE: Mapping[int, tuple[float, ...]] = {
     0: (),
     1: (0.25,),
     2: (0.2, 0.5),
-    3: (0.15, 0.35, 0.6),
-    4: (0.12, 0.27, 0.44, 0.62),
 }
+"""Steps of up to two refinements. With three, 320 voxels begin as 40, which hold no body that fills a third of the box:
+of what cameras see of wild-14, F is 0.82, and 0.86 with two."""
 _PRUNE_AFTER = 0.13  # Share of the run between a refinement and the pruning that drops what it left empty
 _THIN = 0.8
 _VIEW_DEPENDENCE = 0.8
