@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 3445,
-    "capture": 3455,
-    "commands": 2590,
+    "audit": 3345,
+    "capture": 3370,
+    "commands": 2500,
     "core": 1860,
-    "data": 2620,
+    "data": 2465,
     "evaluation": 385,
-    "fem": 2935,
+    "fem": 2805,
     "field": 885,
-    "heat": 2590,
-    "mesh": 4970,
+    "heat": 2390,
+    "mesh": 4665,
     "multiview": 1885,
-    "radiometry": 1320,
-    "render": 1670,
-    "reports": 1340,
+    "radiometry": 1315,
+    "render": 1665,
+    "reports": 1245,
     "synthetic": 2750,
-    "training": 2805,
+    "training": 2715,
     "root": 650,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 28600
+MOST_TEST_LINES = 28300
 
 
 def room_of(module: str) -> str:
