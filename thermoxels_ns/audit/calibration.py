@@ -44,9 +44,9 @@ _STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a 
 _MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Largest step and stopping step of logarithms; most steps
 _FAR = 4.0  # A property whose logarithm moves farther than this from the start is not determined
 _LEAST_K = 0.02  # Least change of surface temperatures, root mean square, if a property becomes e times as large
-_MOST_SPREAD = 0.5  # Largest standard deviation of a logarithm, by the patches' own errors, of a known property
+_MOST_SPREAD = 0.5  # Largest standard deviation of a logarithm, by noise and drift alone, of a known property
 _SMALL_SHARE = 0.1  # Properties with a smaller share than this in a combination are not named
-_OF_A_PATCH, _OF_WHAT_IS_STATED = 3 * 10**6, 5 * 10**6  # Numbers that seed random errors
+_OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers that seed random errors
 
 
 @dataclass(frozen=True)
@@ -334,12 +334,25 @@ class _Fit:
         for number in np.unique(patch):
             yield int(number), gain[:, patch == number].sum(axis=1)
 
+    def _noise(self, gain: FloatArray) -> FloatArray:
+        """Return the covariance, shape (m, m), of `gain` times residuals that noise in the readings of nodes causes.
+
+        A triangle's reading is the mean of three nodes; its variance is a third of the variance of a node.
+        """
+        facets = self.wall.surface.mesh.facets[self.wall.counted]
+        nodes, number = np.unique(facets, return_inverse=True)
+        at_nodes = np.stack([np.bincount(number.ravel(), np.repeat(row / 3.0, 3), len(nodes)) for row in gain])
+        return 3.0 * float(self.weight @ self.residual_k**2) * at_nodes @ at_nodes.T
+
     def _local_spread(self) -> FloatArray:
-        """Return the standard deviation along each direction due to the patches' own errors, shape (m,)."""
+        """Return the standard deviation along each direction due to noise and the patches' own errors, shape (m,)."""
         told = np.maximum(self.sensitive_k, 1e-12)
         gain = (self.directions.T / told[:, None] ** 2) @ (self.slope.T * self.weight)
-        moved = np.stack([step for _, step in self._local(gain)])
-        return self.wall.conditions.camera.repeatability.off_by * np.sqrt((moved**2).sum(axis=0) / 3.0)
+        variance = np.diag(self._noise(gain)).copy()
+        off = self.wall.conditions.camera.repeatability.off_by
+        for _, moved in self._local(gain):
+            variance += off**2 / 3.0 * moved**2
+        return np.sqrt(variance)
 
     def spread(self) -> tuple[FloatArray, list[str], FloatArray]:
         """Return the logarithms of the properties in every draw, (m, k), which quantity moves each property most, and
@@ -349,8 +362,8 @@ class _Fit:
         for the values in between; of formulas each is tried. Effects of several quantities add up.
         """
         gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
-        off = self.wall.conditions.camera.repeatability.off_by
-        drawn = np.repeat(self.logarithm[:, None], self.draws.count, axis=1)
+        off, count = self.wall.conditions.camera.repeatability.off_by, self.draws.count
+        drawn = np.repeat(self.logarithm[:, None], count, axis=1)
         moved: dict[str, FloatArray] = {}
         for name, values in self._uncertain().items():
             if name == FORMULA:
@@ -371,6 +384,9 @@ class _Fit:
             moved[name] = np.abs(above - below)
         for number, step in self._local(gain):
             drawn += step[:, None] * self.draws.local(off, _OF_A_PATCH + number)
+        noise = np.random.default_rng((self.draws.seed, _OF_THE_NOISE)).standard_normal((len(drawn), count))
+        noise[:, 0] = 0.0
+        drawn += np.linalg.cholesky(self._noise(gain) + 1e-18 * np.eye(len(drawn))) @ noise
         most = [max(moved, key=lambda name: moved[name][n]) if moved else "" for n in range(len(self.names))]
         return drawn, most, moved.get(_BEFORE, np.zeros(len(self.names)))
 

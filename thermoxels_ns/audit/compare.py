@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +18,7 @@ from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.yaml_records import as_record, raising
 
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
 _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
@@ -73,6 +74,21 @@ class Pose(NamedTuple):
     def __call__(self, points_m: FloatArray) -> FloatArray:
         """Return points, shape (n, 3), in the coordinates of the later mesh."""
         return points_m @ self.turn.T + self.shift_m
+
+
+@raising(AuditError)
+def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
+    """Return the `conditions` of an answers.json, without what a comparison does not need (limits, calibration)."""
+
+    def known(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        # An air that was not known has the value null.
+        pairs = value.items()
+        return {key: known(one) for key, one in pairs if not (isinstance(one, dict) and one.get("value", 0) is None)}
+
+    unused = {"limits", "energy", "calibrate", "weather", "storeys"}  # older audits have storeys
+    return as_record(name, {key: known(one) for key, one in content.items() if key not in unused}, Conditions)
 
 
 def compare(before: Audit, after: Audit, difference_k: float | None = None) -> Comparison:

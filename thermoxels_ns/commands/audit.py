@@ -268,10 +268,9 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
 
     Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0.
     """
-    from thermoxels_ns.audit.conditions import Conditions
+    from thermoxels_ns.audit.compare import earlier_conditions
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.core.json_values import read_json_object
-    from thermoxels_ns.core.yaml_records import as_record, raising
     from thermoxels_ns.mesh.files.vtu import read_surface
 
     if difference_k is not None:
@@ -282,11 +281,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     if missing or not all(map(is_number, content["up"])):
         got, remedy = f"one without {' and '.join(missing) or 'up'}", f"{again} Audit again first."
         raise AuditError(str(path), expected="the answers.json of an audit", got=got, remedy=remedy)
-    unused = {"limits", "energy", "calibrate", "weather"}  # a comparison does not need them
-    with raising(AuditError):
-        stated = {key: one for key, one in content["conditions"].items() if key not in unused}
-        conditions = as_record(path.name, stated, Conditions)
-    mesh = read_surface(path.with_name(SURFACE))
+    conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
     x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")
     return lambda: audit(mesh, conditions, (x, y, z), least_w if is_number(least_w) else 0.0)
