@@ -108,7 +108,7 @@ class Recorder:
             self.run(
                 "train",
                 *("ns-train", "thermoxels", "--output-dir", work / "outputs", "--experiment-name", "freeze"),
-                *("--timestamp", "run", "--vis", "tensorboard", "--logging.local-writer.enable", "False"),
+                *("--timestamp", "run", "--vis", "tensorboard"),
                 *("--quality", "draft", "thermal-data", "--data", work / "scene"),
             )
         config = run / "config.yml"

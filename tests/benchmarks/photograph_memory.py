@@ -55,8 +55,8 @@ class PhotographMemory:
         """Train; return the most resident memory, [bytes], and the seconds per step of the second half."""
         command = [
             *("ns-train", "thermoxels", "--output-dir", str(self.output / "outputs"), "--vis", "tensorboard"),
-            *("--max-num-iterations", str(self.steps), "--logging.local-writer.max-log-size", "0"),
-            *("--logging.steps-per-log", "10", "thermal-data", "--data", str(scene)),
+            *("--max-num-iterations", str(self.steps), "--logging.steps-per-log", "10"),
+            *("thermal-data", "--data", str(scene)),
         ]
         log = self.output / f"{scene.name}.log"
         run_quietly([Path(sys.executable).name, str(Path(__file__).resolve()), "--run", *command], log)

@@ -169,7 +169,9 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders():
         (2, 2),
     ]
     assert matched_names(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
-    assert matched_names(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == matched_names(["1.jpg", "1.png"], ["1.jpg"]) == []
+    assert matched_names(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == matched_names(["1.tif", "1.png"], ["1.jpg"]) == []
+    for files in (["images/1.jpg", "images/1.npy"], ["images/1.jpg", "images/thermal/1.png"]):
+        assert matched_names(["1.jpg"], files) == [(0, 0)]  # whole names count before names without suffixes
 
 
 def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(tracked):
@@ -261,3 +263,11 @@ def test_files_of_tracks_that_cannot_be_used_are_refused(tracked, spoil, named):
     spoil(folder.path / "tracks.npz", tracks)
     with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
         lines_of(folder)
+
+
+def test_names_with_blanks_in_a_model_of_text_are_read_whole(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 50 50 20 15\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 IMG 1.jpg\n\n")
+    (tmp_path / "points3D.txt").write_text("")
+    _, images, _ = read_model(tmp_path)
+    assert [image.name for image in images.values()] == ["IMG 1.jpg"]

@@ -88,7 +88,11 @@ class RayEvidence:
     ends: Float32Array | None = None
     """Where these rays end: the points at which half of their weight is spent, in corner indices of the lattice, shape
     (rays, 3). None: not known."""
-    directions: Float32Array | None = None  # Unit vectors of these rays, shape (rays, 3)
+    directions: Float32Array | None = None  # Unit vectors of these rays, shape (rays, 3); None only if `ends` is
+
+    def __post_init__(self) -> None:
+        if (self.ends is None) != (self.directions is None):
+            raise MeshError("ray evidence", expected="ends and directions, or neither", got="one", remedy=_FIELD)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from os.path import splitext
@@ -40,15 +41,21 @@ def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, 
     """
     from nerfstudio.data.utils import colmap_parsing_utils  # only needed here
 
-    kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     try:
-        model: Any = colmap_parsing_utils.read_model(str(folder), kind)
+        if (folder / "cameras.bin").is_file():
+            return colmap_parsing_utils.read_model(str(folder), ".bin")
+        import pycolmap  # reads names with blanks in images.txt
+
+        for part in _PARTS:  # pycolmap says of a file that may not be read that it is not there
+            (folder / f"{part}.txt").open("rb").close()
+        with tempfile.TemporaryDirectory() as binary:
+            pycolmap.Reconstruction(str(folder)).write_binary(binary)
+            return colmap_parsing_utils.read_model(binary, ".bin")
     except Exception as problem:  # a damaged file raises struct.error, KeyError, ValueError, MemoryError and others
         expected = "a COLMAP model (cameras, images, points3D as .bin or .txt)"
         got = f"one that cannot be read: {str(problem).strip() or repr(problem)}"
         remedy = remedy_of(problem, "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0.")
         raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem
-    return model
 
 
 def camera_to_world(image: Any) -> FloatArray:
@@ -72,21 +79,25 @@ def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
 
 
 def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the pairs (image, file) of indices that belong to the same photograph, by names without their suffixes.
+    """Return the pairs (image, file) of indices that belong to the same photograph, by names, else without suffixes.
 
     The file's name ends with the image's, folders included. The longest such image is taken; images that then belong to
     several files, and images of one name, are left out.
 
-    >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png"])
-    [(1, 0), (0, 1)]
+    >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png", "images/1.jpg"])
+    [(1, 0), (0, 2)]
     """
-    names = [PurePosixPath(splitext(image)[0]).as_posix() for image in images]
-    often = Counter(names)
-    number = {name: place for place, name in enumerate(names) if often[name] == 1}
-    pairs = []
-    for place, file in enumerate(files):
-        parts = PurePosixPath(splitext(file)[0]).parts
-        endings = ("/".join(parts[first:]) for first in range(len(parts)))
-        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
-    once = Counter(image for image, _ in pairs)
-    return [pair for pair in pairs if once[pair[0]] == 1]
+    found: dict[int, int] = {}
+    for stem in (lambda name: name, lambda name: splitext(name)[0]):
+        names = {place: PurePosixPath(stem(image)).as_posix() for place, image in enumerate(images)}
+        names = {place: name for place, name in names.items() if place not in found}
+        often, taken = Counter(names.values()), set(found.values())
+        number = {name: place for place, name in names.items() if often[name] == 1}
+        pairs = []
+        for place, file in enumerate(files):
+            parts = PurePosixPath(stem(file)).parts if place not in taken else ()
+            endings = ("/".join(parts[first:]) for first in range(len(parts)))
+            pairs += [(number[ending], place) for ending in endings if ending in number][:1]
+        once = Counter(image for image, _ in pairs)
+        found |= {image: place for image, place in pairs if once[image] == 1}
+    return sorted(found.items(), key=lambda pair: pair[1])

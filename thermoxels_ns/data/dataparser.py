@@ -27,7 +27,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
+from thermoxels_ns.data.tracks import TRACKS_KEY, TrackSource, feature_rays, find_tracks
 from thermoxels_ns.radiometry.thermal_pixels import VALID_RANGE_C, ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
@@ -203,7 +203,15 @@ class ThermalDataParser(DataParser):
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
         tracks = None if config.tracks == "off" else find_tracks(file, CONSOLE.print)
-        rays = None if tracks is None else feature_rays(tracks, [file.frames[index] for index in split.train])
+        rays = None
+        if tracks is not None:
+            try:
+                rays = feature_rays(tracks, [file.frames[index] for index in split.train])
+            except SceneError as problem:
+                if TRACKS_KEY in file.meta:
+                    raise
+                tracks = None
+                CONSOLE.print(f"Tracks: the COLMAP model is not used (--tracks off leaves it alone): {problem}")
         given, fitted = file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)

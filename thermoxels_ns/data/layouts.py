@@ -16,7 +16,6 @@ from thermoxels_ns.data.colmap_model import (
     matched_names,
     read_model,
 )
-from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
@@ -118,8 +117,11 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
     """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, and the names of
     those that are not there or not clear (`matched_names`). Subfolders train, val and test become split lists."""
+    from PIL import Image  # the help of commands does not need it
+
     cameras, images, _ = read_model(place)
-    there = (path for path in sorted((folder / root).rglob("*")) if path.suffix.lower() in THERMAL_SUFFIXES)
+    pictures = Image.registered_extensions()
+    there = (path for path in sorted((folder / root).rglob("*")) if path.suffix.lower() in pictures)
     files = [path.relative_to(folder).as_posix() for path in there]
     posed = sorted(images.values(), key=lambda image: image.name)
     file_of = dict(matched_names([image.name for image in posed], files))

@@ -8,6 +8,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
 from thermoxels_ns.core.snapshot import RayEvidence
+from thermoxels_ns.mesh.solid.morphology import bounding_box
 
 REACH = 1.5
 """Distance from where a ray ends, [voxels], up to which it tells voxels how far away the surface is, and behind it
@@ -22,22 +23,28 @@ def without_front(cells: BoolArray, evidence: RayEvidence) -> BoolArray:
     voxel. A voxel's distance to the surface is the mean, over the rays that cross it within `REACH` of their ends, of
     the distance along the ray from its centre to the end (truncated signed distances, Curless and Levoy 1996). A voxel
     in front stays if a ray that ends in it would otherwise meet no solid within `REACH` behind its end, as at a sheet
-    thinner than a voxel. `cells` are the solid voxels, shape (nx-1, ny-1, nz-1).
+    thinner than a voxel. `cells` are the solid voxels, shape (nx-1, ny-1, nz-1), of which at least one is solid. All
+    stay if none would.
     """
     assert evidence.ends is not None and evidence.directions is not None
-    distance = np.zeros(cells.size, dtype=np.float32)  # the sum has the sign of the mean
+    near = bounding_box(cells)
+    solid, directions = cells[near], evidence.directions
+    ends = evidence.ends - np.array([side.start for side in near], dtype=np.float32)
+    distance = np.zeros(solid.size, dtype=np.float32)  # the sum has the sign of the mean
     for off in np.arange(-REACH, REACH + _STEP, _STEP, dtype=np.float32):
-        voxel, inside = _voxels_at(evidence.ends + off * evidence.directions, cells.shape)
-        along = ((evidence.ends[inside] - voxel - 0.5) * evidence.directions[inside]).sum(axis=1)
-        distance += np.bincount(np.ravel_multi_index(tuple(voxel.T), cells.shape), along, cells.size)
-    kept = cells & (distance <= 0.0).reshape(cells.shape)
-    met = np.zeros(len(evidence.ends), dtype=bool)
+        voxel, inside = _voxels_at(ends + off * directions, solid.shape)
+        along = ((ends[inside] - voxel - 0.5) * directions[inside]).sum(axis=1)
+        distance += np.bincount(np.ravel_multi_index(tuple(voxel.T), solid.shape), along, solid.size)
+    kept = solid & (distance <= 0.0).reshape(solid.shape)
+    met = np.zeros(len(ends), dtype=bool)
     for off in np.arange(0.0, REACH + _STEP, _STEP, dtype=np.float32):
-        voxel, inside = _voxels_at(evidence.ends + off * evidence.directions, cells.shape)
+        voxel, inside = _voxels_at(ends + off * directions, solid.shape)
         met[inside] |= kept[tuple(voxel.T)]
-    needed = tuple(_voxels_at(evidence.ends[~met], cells.shape)[0].T)
-    kept[needed] = cells[needed]
-    return kept
+    needed = tuple(_voxels_at(ends[~met], solid.shape)[0].T)
+    kept[needed] = solid[needed]
+    result = np.zeros_like(cells)
+    result[near] = kept if kept.any() else solid
+    return result
 
 
 def ends_in_voxels(evidence: RayEvidence, shape: tuple[int, ...]) -> IntArray:

@@ -1,4 +1,4 @@
-"""Choice of the solid voxels: threshold, closing of gaps, region, removal of floaters, wall thickness, interior."""
+"""Choice of the solid voxels: threshold, closing of gaps, region, removal of floaters, interior, surface, walls."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def select_solid(
     metres_per_world_unit: float = 1.0,
     world_to_input: FloatArray | None = None,
 ) -> SolidCells:
-    """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
+    """Return the solid voxels of a trained field, chosen by their density and then changed by further steps.
 
     `metres_per_world_unit` is used for a wall thickness only, which also needs the cameras. `world_to_input`, shape
     (3, 4), maps world coordinates to those of the region's box or point; None is the identity.
@@ -139,13 +139,11 @@ def select_solid(
         cells = step("close gaps", close_gaps(cells, selection.close_gaps), remark)
     everything = cells
     within, remark = _region(cells, snapshot, selection, world_to_input)
-    labels, least = connected(cells & within), 0.0 if selection.region == "all" else SMALLEST_BODY
-    sizes = np.bincount(labels.ravel())[1:]
-    small = sizes < least * sizes.max()
-    remark += (
-        f" {small.sum()} of {len(sizes)} bodies in it have less than {least:.0%} of the largest one's voxels and go."
-    )
-    cells = step("region", np.append(False, ~small)[labels], remark)
+    least = 0.0 if selection.region == "all" else SMALLEST_BODY
+    large, sizes = _large_bodies(cells & within, least)
+    small = np.count_nonzero(sizes < least * sizes.max())
+    remark += f" {small} of {len(sizes)} bodies in it have less than {least:.0%} of the largest one's voxels and go."
+    cells = step("region", large, remark)
     left_out = everything & ~cells
     # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
     opaque, rooms = cells | (everything & ~within), None
@@ -156,7 +154,7 @@ def select_solid(
     if chosen.by_rays:
         assert snapshot.evidence is not None
         remark = "Voxels with their centres in front of where rays end go, unless a ray then meets no solid."
-        cells = step("surface", without_front(cells, snapshot.evidence), remark)
+        cells = step("surface", _large_bodies(without_front(cells, snapshot.evidence), least)[0], remark)
         opaque = cells | (everything & ~within)
     if wall_m is not None:
         assert snapshot.views is not None, "the side that is seen is that of the cameras"
@@ -182,6 +180,13 @@ def select_solid(
         left_out=left_out,
         rooms=rooms,
     )
+
+
+def _large_bodies(cells: BoolArray, least: float) -> tuple[BoolArray, IntArray]:
+    """Return the voxels of bodies that have at least the share `least` of the largest one's, and the size of each."""
+    labels = connected(cells)
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.append(False, sizes >= least * sizes.max())[labels], sizes
 
 
 @dataclass(frozen=True)
