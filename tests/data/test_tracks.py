@@ -263,11 +263,3 @@ def test_files_of_tracks_that_cannot_be_used_are_refused(tracked, spoil, named):
     spoil(folder.path / "tracks.npz", tracks)
     with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
         lines_of(folder)
-
-
-def test_names_with_blanks_in_a_model_of_text_are_read_whole(tmp_path):
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 50 50 20 15\n")
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 IMG 1.jpg\n\n")
-    (tmp_path / "points3D.txt").write_text("")
-    _, images, _ = read_model(tmp_path)
-    assert [image.name for image in images.values()] == ["IMG 1.jpg"]

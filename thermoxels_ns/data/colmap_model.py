@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from os.path import splitext
@@ -41,16 +40,9 @@ def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, 
     """
     from nerfstudio.data.utils import colmap_parsing_utils  # only needed here
 
+    kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     try:
-        if (folder / "cameras.bin").is_file():
-            return colmap_parsing_utils.read_model(str(folder), ".bin")
-        import pycolmap  # reads names with blanks in images.txt
-
-        for part in _PARTS:  # pycolmap says of a file that may not be read that it is not there
-            (folder / f"{part}.txt").open("rb").close()
-        with tempfile.TemporaryDirectory() as binary:
-            pycolmap.Reconstruction(str(folder)).write_binary(binary)
-            return colmap_parsing_utils.read_model(binary, ".bin")
+        return colmap_parsing_utils.read_model(str(folder), kind)
     except Exception as problem:  # a damaged file raises struct.error, KeyError, ValueError, MemoryError and others
         expected = "a COLMAP model (cameras, images, points3D as .bin or .txt)"
         got = f"one that cannot be read: {str(problem).strip() or repr(problem)}"
