@@ -83,7 +83,7 @@ def build_mesh(
         corners, tets = kuhn_tets(solid.cells)
         points, facets = corners.astype(np.float64), boundary_facets(tets)
     else:
-        level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells)
+        level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells, solid.distance)
         stuffed = sharpen(stuff(level), level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
     known = snapshot.temperature_c

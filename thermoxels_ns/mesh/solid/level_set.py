@@ -37,6 +37,7 @@ def level_of(
     threshold: float,
     dense: BoolArray,
     cells: BoolArray,
+    distance: Float32Array | None = None,
 ) -> Float32Array:
     """Return a level in [-1, 1] for every voxel: above 0 in solid voxels, below 0 in empty voxels, 0 on the surface.
 
@@ -52,6 +53,8 @@ def level_of(
         dense: True for voxels that the threshold chose.
         cells: True for solid voxels. Solid voxels that are not dense were added by a later step and get level 1 before
             smoothing; dense voxels that are not solid were removed by a later step and get level -1.
+        distance: Distance of voxel centres in front of where rays end, [voxels]; where it is known, not NaN, its
+            negative is the level before smoothing. None: nowhere known.
     """
     result = np.full(cells.shape, -1.0, dtype=np.float32)
     near, threshold = bounding_box(cells, MARGIN), max(threshold, float(np.finfo(np.float64).tiny))
@@ -67,6 +70,9 @@ def level_of(
     np.clip(level, -1.0, 1.0, out=level)
     level[cells & ~dense] = 1.0
     level[dense & ~cells] = -1.0
+    if distance is not None:
+        known = np.isfinite(distance[near])
+        level[known] = np.clip(-distance[near][known], -1.0, 1.0)
     level = _signed(level, np.float32(LEAST_LEVEL), cells)
 
     smooth = level.copy()

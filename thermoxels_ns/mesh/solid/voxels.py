@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
@@ -18,7 +18,7 @@ from thermoxels_ns.core.yaml_records import record, wrong
 from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
-from thermoxels_ns.mesh.solid.ray_ends import ends_in_voxels, without_front
+from thermoxels_ns.mesh.solid.ray_ends import distance_to_ends, ends_in_voxels, without_front
 
 RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
@@ -98,6 +98,7 @@ class SolidCells:
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
     rooms: BoolArray | None  # True for empty voxels inside hollow walls of given thickness; None for other solids
+    distance: Float32Array | None = None  # Result of `distance_to_ends`; None: rays did not choose the voxels
 
 
 def select_solid(
@@ -151,10 +152,12 @@ def select_solid(
         inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
         remark = "Cavities without a camera are filled, and what cameras cannot look into within the hull of a body."
         cells = step("interior", cells | inside, remark)
+    distance = None
     if chosen.by_rays:
         assert snapshot.evidence is not None
         remark = "Voxels with their centres in front of where rays end go, unless a ray then meets no solid."
-        cells = step("surface", _large_bodies(without_front(cells, snapshot.evidence), least)[0], remark)
+        distance = distance_to_ends(snapshot.evidence, cells.shape)
+        cells = step("surface", _large_bodies(without_front(cells, snapshot.evidence, distance), least)[0], remark)
         opaque = cells | (everything & ~within)
     if wall_m is not None:
         assert snapshot.views is not None, "the side that is seen is that of the cameras"
@@ -179,6 +182,7 @@ def select_solid(
         within=within,
         left_out=left_out,
         rooms=rooms,
+        distance=distance,
     )
 
 
