@@ -42,12 +42,13 @@ def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, 
 
     kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     try:
-        return colmap_parsing_utils.read_model(str(folder), kind)
+        model: Any = colmap_parsing_utils.read_model(str(folder), kind)
     except Exception as problem:  # a damaged file raises struct.error, KeyError, ValueError, MemoryError and others
         expected = "a COLMAP model (cameras, images, points3D as .bin or .txt)"
         got = f"one that cannot be read: {str(problem).strip() or repr(problem)}"
         remedy = remedy_of(problem, "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0.")
         raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem
+    return model
 
 
 def camera_to_world(image: Any) -> FloatArray:

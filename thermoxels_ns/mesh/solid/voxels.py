@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
