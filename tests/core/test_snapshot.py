@@ -69,21 +69,18 @@ def test_a_pipeline_fills_evidence_and_views_from_both_streams(tmp_path):
     assert (np.einsum("ni,ni->n", towards, -views.camera_to_world[:, :, 2]) > 0).all()  # they look at the box
 
 
-def test_what_is_shown_well_ends_where_parallax_fixes_points_too_poorly():
-    """Two cameras 2 apart look at a point 4 away from both: precision falls with the fourth power of that distance."""
-    pair = np.array([(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
-    views, reach = looking_at((0.0, 15.0**0.5, 0.0), pair, focal=200.0), np.full(2, 4.0)
-    places = np.array([(0.0, 3.0, 0.0), (0.0, 8.3, 0.0), (0.0, 8.5, 0.0)])  # 4 / 0.05^(1/4) away from both: y is 8.40
-    assert views.shown_well(places, reach).tolist() == [True, True, False]
-    # A turned away camera, or one of which it is not known what it is pointed at, tells nothing.
-    assert not views.shown_well(np.array([(0.0, -3.0, 0.0)]), reach).any()
-    assert views.shown_well(places, np.array([4.0, np.nan])).all()  # a single camera: no parallax anywhere
-    assert views.shown_well(places, np.full(2, np.nan)).all()
-
-
-def test_open_ground_shown_well_ends_where_cameras_stand():
+def test_what_is_shown_well_ends_where_pixels_per_area_fall_off():
+    """Eight cameras 2 away from a point at which all are pointed; visibility falls with the square of the distance."""
     angle = 0.25 * np.pi * np.arange(8)
-    ring = 2.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
-    views = looking_at((0.0, 0.0, 0.0), ring, focal=200.0)
+    views = looking_at((0.0, 0.0, 0.0), 2.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle)), focal=200.0)
+    reach = np.full(8, 2.0)
     places = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.5, 0.0, 0.0), (0.0, 0.0, 3.0)])
-    assert views.shown_well(places, np.full(8, 2.0)).tolist() == [True, True, False, False]
+    # At (2.5, 0, 0), seen by three of eight, it is 0.6 / 8; nobody looks up to (0, 0, 3).
+    assert views.shown_well(places, reach).tolist() == [True, True, False, False]
+    one = np.where(np.arange(8) == 0, reach, np.nan)  # of the others it is not known what they are pointed at
+    behind = np.array([(-2.9, 0.0, 0.0), (-3.5, 0.0, 0.0), (2.9, 0.0, 0.0)])
+    assert views.shown_well(behind, one).tolist() == [True, False, False]  # (2 / 4.9)^2 = 0.17, (2 / 5.5)^2 = 0.13
+    # Pointed at what is 3 away, it shows places up to 3 / sqrt(0.15) = 7.7 away well.
+    farther = np.array([(-5.5, 0.0, 0.0), (-6.0, 0.0, 0.0)])
+    assert views.shown_well(farther, 1.5 * one).tolist() == [True, False]
+    assert views.shown_well(places, np.full(8, np.nan)).all()

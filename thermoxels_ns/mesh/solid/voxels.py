@@ -44,7 +44,7 @@ FEWEST_RAYS = 100  # least number of rays that end on something for the threshol
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
 SEAL = 2  # to find the interior, openings up to twice this many voxels wide count as closed
-MOST_BLOCKS = 100_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
+MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
 @record(MeshError)
