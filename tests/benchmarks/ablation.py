@@ -87,7 +87,7 @@ MECHANISMS: Mapping[str, Without] = {
     "keep-ends": Without(replaced=((_CALLBACKS, "voxel_weights", _without_ends),)),
     "thinning": Without((f"{_MODEL}thin-threshold", "0")),
     "box-shown-well": Without(replaced=(("thermoxels_ns.core.snapshot", "SHOWN_WELL", 0.0),)),
-    "front": Without(replaced=(("thermoxels_ns.mesh.solid.ray_ends", "REACH", -2.0),)),
+    "front": Without(replaced=(("thermoxels_ns.mesh.solid.free_space", "REACH", -2.0),)),
     "surroundings": Without((f"{_MODEL}surroundings", "off")),
     "bend": Without((_LOSS, "bend", "0")),
     "distortion": Without((_LOSS, "distortion", "0")),

@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from thermoxels_ns.core.feature_rays import THERMAL_STREAM
-from thermoxels_ns.field.interpolation import TrilinearPoints, splat
+from thermoxels_ns.field.interpolation import splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
 
@@ -128,10 +128,10 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
         at_half, ray = samples.at.select(half_way), samples.ray[half_way]
-        place = torch.stack(torch.unravel_index(grid.cells[at_half.number], grid.lattice.cell_shape), -1)
-        ends.append((place + at_half.fraction).to(corners.dtype))
+        voxel = torch.stack(torch.unravel_index(grid.cells[at_half.number], grid.lattice.cell_shape), -1)
+        ends.append((voxel + at_half.fraction).to(corners.dtype))
         along.append(directions[ray].to(corners.dtype))
-        half_depth.append(_density_met(grid, centre_density, at_half, directions[ray]))
+        half_depth.append(_density_met(centre_density, voxel, at_half.fraction, directions[ray]))
         stream = bundle.metadata.get("stream")
         ends_here = samples.transmittance < 0.5
         if stream is not None:
@@ -149,14 +149,19 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
 
 
 def _density_met(
-    grid: VoxelGrid, centre_density: Float[Tensor, "x y z"], at: TrilinearPoints, directions: Float[Tensor, "n 3"]
+    centre_density: Float[Tensor, "x y z"],
+    voxel: Int64[Tensor, "n 3"],
+    fraction: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, " n"]:
-    """Return for each point the highest density at the centres of voxels that its direction meets in `END_WIDTH`."""
-    shape = torch.tensor(grid.lattice.cell_shape, device=centre_density.device)
-    voxel = torch.stack(torch.unravel_index(grid.cells[at.number], grid.lattice.cell_shape), -1)
+    """Return the highest density at the centres of voxels that a direction meets in `END_WIDTH` around each point.
+
+    A point lies in the voxel of this index, at this fraction of the voxel along each axis.
+    """
+    shape = torch.tensor(centre_density.shape, device=centre_density.device)
     met = torch.zeros(len(voxel), dtype=centre_density.dtype, device=centre_density.device)
     for offset in torch.linspace(-END_WIDTH, END_WIDTH, _END_STEPS).tolist():
-        there = voxel + torch.floor(at.fraction + offset * directions.to(at.fraction.dtype)).long()
+        there = voxel + torch.floor(fraction + offset * directions.to(fraction.dtype)).long()
         inside = ((there >= 0) & (there < shape)).all(-1)
         x, y, z = there.clamp(min=0).minimum(shape - 1).unbind(-1)
         met = torch.where(inside, torch.maximum(met, centre_density[x, y, z]), met)

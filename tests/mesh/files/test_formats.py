@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
-from thermoxels_ns.mesh.files.glb import write_glb
+from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_glb, write_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import nodes_and_triangles
 

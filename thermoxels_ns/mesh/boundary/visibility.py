@@ -9,7 +9,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.free_space import first_solid
+from thermoxels_ns.mesh.solid.free_space import first_solid, solid_at
 
 START_ABOVE_SURFACE = (1.0, 0.5)
 """Distances along the normal from a triangle to the start of its line of sight, [voxels]. The first leads past the
@@ -57,10 +57,10 @@ def facet_views(
     middle, normal = np.stack(mean[:3], axis=1), np.stack(mean[3:], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)  # not zero: the main components in a group have one sign
     start = middle + START_ABOVE_SURFACE[0] * normal
-    inside = _solid_at(cells, start)
+    inside = solid_at(cells, start)
     start[inside] = (middle + START_ABOVE_SURFACE[1] * normal)[inside]
     world, seen = lattice.index_to_world(middle), np.zeros((len(middle), len(centres)), dtype=np.bool_)
-    (possible,) = np.nonzero(~_solid_at(cells, start))
+    (possible,) = np.nonzero(~solid_at(cells, start))
     for camera, (matrix, eye, size) in enumerate(zip(matrices, lattice.world_to_index(centres), sizes)):
         column, row, depth = matrix[:, :3] @ world[possible].T + matrix[:, 3:]
         held = (depth > 0) & (column >= 0) & (column <= size[0] * depth) & (row >= 0) & (row <= size[1] * depth)
@@ -80,11 +80,3 @@ def seen_facets(
     cameras = views.matrices(), views.camera_to_world[:, :, 3], views.size
     found = facet_views(cells, lattice, *cameras, centroids_world, normals_world)
     return found.seen.any(axis=1)[found.group]
-
-
-def _solid_at(cells: BoolArray, points: FloatArray) -> BoolArray:
-    """Return which points (n, 3), in corner indices, are in solid voxels, shape (n,); False outside the lattice."""
-    index = np.floor(points).astype(np.int64)
-    inside = np.all((index >= 0) & (index < cells.shape), axis=1)
-    index[~inside] = 0
-    return cells[tuple(index.T)] & inside

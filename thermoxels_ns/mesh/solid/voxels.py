@@ -15,10 +15,15 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.yaml_records import record, wrong
-from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
+from thermoxels_ns.mesh.solid.free_space import (
+    MOST_CAMERAS,
+    distance_to_ends,
+    ends_in_voxels,
+    first_solid,
+    without_front,
+)
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
-from thermoxels_ns.mesh.solid.ray_ends import distance_to_ends, ends_in_voxels, without_front
 
 RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
