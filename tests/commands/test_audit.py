@@ -19,6 +19,7 @@ from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographe
 from tests.support.flat_houses import house_corner
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns import cli
+from thermoxels_ns.audit.compare import earlier_conditions
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.commands.audit import Audit, run_audit
 from thermoxels_ns.core.errors import AuditError
@@ -315,6 +316,11 @@ def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, don
     assert all(abs(one["change"]["value"]) < 1e-9 and not one["significant"] for one in compared["elements"])
     assert page.index("element by element") < page.index("What changed since") < page.index("Thermal bridges and")
     assert "earlier survey: none" in capsys.readouterr().out and "answers.json" in dict(answers["report"]["inputs"])
+    stated = answers["conditions"]
+    old = earlier_conditions("answers.json", stated | {"storeys": {"ground floor": []}})  # older audits have them
+    assert old == earlier_conditions("answers.json", stated)
+    with pytest.raises(AuditError, match="colour"):
+        earlier_conditions("answers.json", stated | {"colour": 1.0})
     given = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml"), "--compare"]
     before = (done / "answers.json").read_bytes()
     assert cli.main([*given, str(done / "answers.json"), "--output-dir", str(done)]) == 2

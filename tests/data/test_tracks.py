@@ -225,6 +225,17 @@ def test_badly_known_points_and_those_behind_a_camera_are_left_out(tracked):
         assert len(feature_rays(tracks, some).points) == 0
 
 
+def test_a_model_whose_points_lie_behind_the_cameras_is_left_out_and_said(scene_folder, capsys):
+    scene = scene_folder(frames=len(NAMES), names=NAMES)
+    frames = frames_of(scene)
+    lens, poses = frames[0].intrinsics, [frame.pose for frame in frames]
+    camera = Camera(lens.width, lens.height, lens.fl_x, lens.fl_y, lens.cx, lens.cy)
+    names, behind = [frame.image.name for frame in frames], POINTS + np.array([0.0, 0.0, 100.0])
+    write_colmap_model(scene.path / "sparse/0", names, poses, camera, behind, lens="PINHOLE")
+    assert lines_of(scene).metadata["feature_rays"] is None
+    assert "the COLMAP model is not used" in " ".join(capsys.readouterr().out.split())
+
+
 def test_the_error_of_a_length_is_that_of_a_triangulation(tracked):
     folder, _ = tracked
     frame = frames_of(folder)[0]

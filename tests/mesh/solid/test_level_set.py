@@ -41,6 +41,17 @@ def test_the_surface_of_a_smooth_ramp_lies_within_a_tenth_of_a_voxel(ramp, offse
     assert np.abs(found - (9.0 + offset)).max() <= 0.1
 
 
+@pytest.mark.parametrize("place", np.linspace(5.1, 6.0, 7))
+def test_the_surface_lies_where_rays_end_whatever_the_density(place):
+    """Rays tell distances of voxels up to one from the surface; density alone places it between two voxel centres."""
+    front = np.broadcast_to(place - np.arange(12.0)[:, None, None], (12, 6, 6))  # of voxel centres
+    cells = front <= 0.0
+    density, told = np.where(cells, 100.0, 0.0), np.where(np.abs(front) < 1.5, front, np.nan).astype(np.float32)
+    found = crossings(level_of(density, 1.0, cells, cells, told))
+    assert len(found) == 36 and np.abs(found - place).max() <= 0.1
+    assert np.abs(crossings(level_of(density, 1.0, cells, cells)) - np.ceil(place) + 0.5).max() <= 0.1
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_walls_and_gaps_one_voxel_thick_keep_their_thickness(axis):
     wall = np.zeros((9, 9, 9))

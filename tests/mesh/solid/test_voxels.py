@@ -6,7 +6,7 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot, Views
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid, where_cameras_look
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, facet_normals
@@ -95,6 +95,26 @@ def test_a_region_without_solid_says_where_it_lies_and_the_remedy_works(asked):
     values = tuple(float(word) for word in remedy.split())
     solid = select_solid(snapshot, replace(AS_IT_IS, region_box=values), world_to_input=TURNED)
     assert np.array_equal(solid.cells, OBJECT)
+
+
+def test_the_solid_ends_where_rays_end_unless_the_user_chose_its_density():
+    """Rays along x end at 6.7, in the first layer of a block, and at 2.7, in one of a lump that is then too small."""
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (21, 21, 21))
+    block, lump = box(lattice, (6.0, 5.0, 5.0), (13.0, 15.0, 15.0)), box(lattice, (2.0, 1.0, 1.0), (4.0, 3.0, 3.0))
+    across = np.arange(0.25, 20.0, 0.5)
+    y, z = (values.ravel() for values in np.meshgrid(across, across))
+    met = [((y > low) & (y < high) & (z > low) & (z < high), place) for low, high, place in ((5, 15, 6.7), (1, 3, 2.7))]
+    ends = np.concatenate([np.column_stack((np.full(hit.sum(), place), y[hit], z[hit])) for hit, place in met])
+    along = np.tile([1.0, 0.0, 0.0], (len(ends), 1))
+    of_rays = (values.astype(np.float32) for values in (np.full(len(ends), 50.0), ends, along))
+    whole = field(lattice, block | lump, None)
+    snapshot = replace(whole, evidence=RayEvidence(np.zeros(lattice.cell_shape, np.float32), *of_rays))
+    solid = select_solid(snapshot, AS_IT_IS)
+    first = box(lattice, (6.0, 0.0, 0.0), (7.0, 20.0, 20.0))
+    assert np.array_equal(solid.cells, block & ~first) and solid.distance is not None
+    assert solid.distance[6, 10, 10] == pytest.approx(0.2) and np.isnan(solid.distance[15, 10, 10])
+    asked = select_solid(snapshot, replace(AS_IT_IS, density_threshold=10.0))
+    assert np.array_equal(asked.cells, block | lump) and asked.distance is None
 
 
 def test_a_hollow_house_that_a_box_halves_is_filled_up_to_the_box():
