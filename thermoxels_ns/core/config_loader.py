@@ -48,6 +48,7 @@ class ConfigLoader(yaml.Loader):
 
     def get_single_data(self) -> Any:
         """Return the content of the file; raise `CheckpointError` if it cannot be read safely."""
+        folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None  # also if what follows fails
         try:
             node = self.get_single_node()
         except RecursionError as problem:
@@ -55,7 +56,6 @@ class ConfigLoader(yaml.Loader):
             got = "entries nested too deeply to read"
             raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
         found = None if node is None else self.construct_document(node)
-        folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None
         if folder is not None and found is not None and hasattr(found, "moved_to"):
             found.moved_to(folder)
         return found
@@ -90,7 +90,6 @@ def check_run(config: Path) -> dict[str, Any]:
             got = " ".join(str(problem).split())
     if not isinstance(content, dict):
         raise CheckpointError("load_config", expected="the config.yml of a run", got=f"{config}: {got}", remedy=remedy)
-    ConfigLoader.run_folder = config.parent
     try:
         models = config.parent.joinpath(*content["relative_model_dir"])
         manager, from_run = content["pipeline"]["datamanager"], content["scene_from_run"]  # other methods lack it
@@ -104,6 +103,7 @@ def check_run(config: Path) -> dict[str, Any]:
         expected, remedy = "the photographs that it was trained on", f"Put the scene folder at {told}"
         remedy += f", or at {from_run} as seen from the folder of the run." if from_run else "."
         raise CheckpointError(f"scene of {config}", expected=expected, got="none", remedy=remedy)
+    ConfigLoader.run_folder = config.parent
     return content
 
 
