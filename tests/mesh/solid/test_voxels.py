@@ -113,6 +113,10 @@ def test_the_solid_ends_where_rays_end_unless_the_user_chose_its_density():
     first = box(lattice, (6.0, 0.0, 0.0), (7.0, 20.0, 20.0))
     assert np.array_equal(solid.cells, block & ~first) and solid.distance is not None
     assert solid.distance[6, 10, 10] == pytest.approx(0.2) and np.isnan(solid.distance[15, 10, 10])
+    mesh = build_mesh(snapshot, AS_IT_IS, np.eye(4), "conforming").mesh
+    x, y, z = mesh.points_m[np.unique(mesh.facets)].T
+    front = x[(x < 8.0) & (np.abs(y - 10.0) < 3.0) & (np.abs(z - 10.0) < 3.0)]
+    assert len(front) > 9 and front == pytest.approx(np.full(len(front), 6.7), abs=0.1)
     asked = select_solid(snapshot, replace(AS_IT_IS, density_threshold=10.0))
     assert np.array_equal(asked.cells, block | lump) and asked.distance is None
 
