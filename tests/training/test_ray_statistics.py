@@ -101,6 +101,8 @@ def test_what_leaks_through_a_surface_measures_nothing_and_ends_nothing_behind_i
     leaked = evidence.voxel_weight.view(6, 6, 6).sum((1, 2))
     assert len(evidence.ends) == 1600 and 3.0 < evidence.ends[:, 0].min() <= evidence.ends[:, 0].max() < 5.0
     assert torch.equal(evidence.directions, torch.tensor([-1.0, 0.0, 0.0]).expand(1600, 3))
+    across = torch.cat([bundle.origins[:, 1:] for bundle in rays_along_minus_x()])
+    torch.testing.assert_close(evidence.ends[:, 1:], 3.0 * (across + 1.0), atol=1e-4, rtol=0)
     assert float(leaked[:3].sum()) == pytest.approx(160, rel=0.02)
     weight = evidence.thermal_weight.view(7, 7, 7)
     assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0

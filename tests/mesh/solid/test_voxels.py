@@ -117,6 +117,9 @@ def test_the_solid_ends_where_rays_end_unless_the_user_chose_its_density():
     x, y, z = mesh.points_m[np.unique(mesh.facets)].T
     front = x[(x < 8.0) & (np.abs(y - 10.0) < 3.0) & (np.abs(z - 10.0) < 3.0)]
     assert len(front) > 9 and front == pytest.approx(np.full(len(front), 6.7), abs=0.1)
+    seen = replace(snapshot, views=looking_at((10.0, 10.0, 10.0), (-40.0, 10.0, 10.0)))
+    wall = select_solid(seen, replace(AS_IT_IS, wall_thickness=9.0)).cells
+    assert np.flatnonzero(wall[:, 10, 10]).tolist() == list(range(7, 16))  # as thick as asked from where rays end on
     asked = select_solid(snapshot, replace(AS_IT_IS, density_threshold=10.0))
     assert np.array_equal(asked.cells, block | lump) and asked.distance is None
 
