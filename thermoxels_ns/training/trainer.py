@@ -16,7 +16,6 @@ import tyro
 import yaml
 from filelock import FileLock
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, replace_when_done, writable_folder
@@ -207,8 +206,6 @@ class ThermoxelsTrainer(Trainer):
             super().setup(test_mode)
         if self.local_rank == 0:
             self.save_found_settings()
-        # nerfstudio shows progress and remaining time by the number of steps, without the steps of earlier runs.
-        writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
     def save_found_settings(self) -> None:
         """Write the scene box and the resolutions that were found from the photographs into config.yml."""
