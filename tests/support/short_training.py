@@ -86,32 +86,19 @@ class Training:
         return file.getvalue()
 
 
-def train(scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0):
-    """Train the default method on a scene at 16 voxels, or as `model` says, and return its pipeline."""
-    return train_with_optimizers(scene, steps, model, rays, rate)[0]
-
-
-def train_with_optimizers(
-    scene: Path,
-    steps: int,
-    model: dict[str, Any] | None = None,
-    rays: int = 512,
-    rate: float = 1.0,
-    threads: int | None = 1,
-) -> tuple[ThermoxelsPipeline, Optimizers]:
-    """The same, and return the optimisers too.
+def train(
+    scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0
+) -> ThermoxelsPipeline:
+    """Train the default method on a scene on one thread, and return its pipeline.
 
     Args:
         scene: Scene folder.
         steps: Training steps.
-        model: Overrides of the model's configuration; lattice changes happen where it says so.
+        model: Overrides of the model's configuration: 16 voxels, and changes of the lattice where it says so.
         rays: Rays of each stream per step.
         rate: Factor on all learning rates.
-        threads: Threads of the compiled kernels.
     """
     plain = {"resolutions": [16], "refine_at": [], "prune_at": [], "thin_at": []}
     data = {"data": scene, "train_num_rays_per_batch": rays, "thermal_num_rays_per_batch": rays}
-    overrides = {"cpu_threads": threads, "datamanager": data, "model": plain | (model or {})}
-    training = Training(overrides, steps, rate=rate).advance(steps)
-    training.pipeline.eval()
-    return training.pipeline, training.optimizers
+    overrides = {"cpu_threads": 1, "datamanager": data, "model": plain | (model or {})}
+    return Training(overrides, steps, rate=rate).advance(steps).pipeline.eval()
