@@ -2,6 +2,7 @@
 
 import csv
 import json
+import multiprocessing
 import os
 import sys
 import time
@@ -53,6 +54,18 @@ def take_turns(
             if run:
                 seconds[name].append(clock() - begin)
     return seconds, results
+
+
+def in_own_process(work: Callable[..., Any], *given: Any) -> Any:
+    """Call a function of a module in a process of its own, so that its peak memory is its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(work, given)
+
+
+def peak_memory_bytes() -> int:
+    """Most resident memory that this process ever had. Linux; what `resource` gives there includes the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 def synthetic_scene(name: str, folder: Path) -> SyntheticScene:

@@ -9,7 +9,6 @@ command that a user types. Printed are the most resident memory, the seconds of 
 
 import json
 import os
-import resource
 import sys
 import time
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import tyro
-from measuring import print_head, print_row, run_quietly
+from measuring import peak_memory_bytes, print_head, print_row, run_quietly
 from PIL import Image
 
 from thermoxels_ns.synthetic.drawn_scenes import make_scene
@@ -100,8 +99,10 @@ def run(words: list[str]) -> None:
     sys.argv = words
     begin()
     half = len(times) // 2
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"peak": peak, "per_step": (times[-1] - times[half]) / (len(times) - 1 - half)}), flush=True)
+    print(
+        json.dumps({"peak": peak_memory_bytes(), "per_step": (times[-1] - times[half]) / (len(times) - 1 - half)}),
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
