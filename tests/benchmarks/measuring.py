@@ -149,12 +149,23 @@ def print_head(*columns: str) -> None:
     print(len(columns) * "|---" + "|", flush=True)
 
 
-def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows that are there."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a row; the first one brings the names of the columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    first = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(row))
+        if first:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 def logarithmic_panels(lines: int, columns: int, **options: Any) -> tuple[Any, Any]:
