@@ -1,4 +1,4 @@
-"""Sums over rows: the order of samples, and that no split of the rows changes a sum."""
+"""Sums over rows: no split of the rows changes a sum."""
 
 from dataclasses import replace
 
@@ -18,10 +18,7 @@ from tests.reference.two_renderers import (
 )
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused
-from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.kernels import AHEAD, prefetch
-from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.training.optimizers import touched_rows
 
 
 @pytest.fixture
@@ -59,21 +56,6 @@ def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch)
         assert fused._room[len(grid.density)] > room
         assert all(torch.equal(found.gradients[name], value) for name, value in expected.gradients.items())
         assert all(torch.equal(found.values[name], value) for name, value in expected.values.items())
-
-
-@pytest.mark.parametrize("renders", [1, 2])
-def test_gradients_of_renders_in_one_step_are_summed_in_the_order_of_rows(renders):
-    """Torch puts one list of rows behind the other, which the optimisers must find and put in order."""
-    grid, flat = random_grid(1, kept=0.5), RenderOptions()
-    dense = []
-    for seed in range(renders):
-        request = random_request(grid, 80, seed)
-        dense.append(torch.autograd.grad(fused_render(grid, request, flat).rgb.sum(), grid.sh)[0].to_dense())
-        fused_render(grid, request, flat).rgb.sum().backward()
-    assert not grid.sh.grad.is_coalesced()
-    rows, values = touched_rows(grid.sh.grad)
-    assert bool((rows[1:] > rows[:-1]).all())
-    torch.testing.assert_close(torch.zeros_like(grid.sh).index_add(0, rows, values).detach(), sum(dense))
 
 
 @njit(error_model="numpy")

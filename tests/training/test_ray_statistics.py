@@ -135,18 +135,6 @@ def test_evidence_spends_every_ray_s_opacity_and_no_more(backend):
     torch.testing.assert_close(evidence.voxel_weight.float(), total_weight(scene), rtol=1e-4, atol=1e-4)
 
 
-def test_half_depth_has_the_density_of_the_wall_that_each_ray_ends_on(backend):
-    """The wall is twice as dense where y > 0; the rays come row by row of y, so their order is known."""
-    scene = slab(backend)
-    y = torch.as_tensor(scene.grid.lattice.corner_positions()[..., 1]).reshape(-1, 1)
-    scene.grid.density.data *= torch.where(y > 0.01, 2.0, torch.where(y < -0.01, 1.0, 1.5))
-    found = field_evidence(*scene, rays_along_minus_x()).half_depth_density
-    # In the layer in front of the last solid corners half of the corners are solid.
-    centres = torch.tensor([250.0, 250.0, 312.5, 437.5, 500.0, 500.0])
-    origins = torch.cat([bundle.origins for bundle in rays_along_minus_x()])
-    torch.testing.assert_close(found, centres[((origins[:, 1] + 1) * 3).long()])
-
-
 @pytest.mark.parametrize(
     ("let_through", "wall", "found"), [(2 / 3, 500.0, 250.0), (1 / 3, 500.0, None), (0.1, -3e3 * math.log(0.1), None)]
 )
