@@ -148,15 +148,9 @@ def test_resume_goes_on_from_the_checkpoint(trained: Trained, tmp_path):
         assert torch.equal(tensor, resumed[name]), name
 
 
-def test_thermal_images_alone(tiny_scene, tmp_path):
-    """The baseline trains, evaluates and exports without colour."""
-    succeed(
-        *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path), "--experiment-name", "t", "--timestamp", "run"),
-        *SHORT_TRAINING,
-        *("thermal-data", "--data", str(tiny_scene)),
-    )
-    config = str(tmp_path / "t" / "plenoxels-t" / "run" / "config.yml")
-    succeed("ns-eval", "--load-config", config, "--output-path", str(tmp_path / "eval.json"))
+def test_thermal_images_alone(thermal_trained: Trained, tmp_path):
+    """The baseline evaluates without colour."""
+    succeed("ns-eval", "--load-config", str(thermal_trained.config), "--output-path", str(tmp_path / "eval.json"))
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert np.isfinite(results["thermal_psnr"]) and "psnr" not in results
 
