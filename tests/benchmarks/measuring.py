@@ -101,18 +101,17 @@ def trained(
     """
     from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING
 
-    began = time.perf_counter()
     command = [*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"]
-    run_quietly([*command, *PLAIN_TRAINING, *options, "thermal-data", "--data", str(scene)], folder / "train.log")
-    return time.perf_counter() - began
+    command += [*PLAIN_TRAINING, *options, "thermal-data", "--data", str(scene)]
+    return run_quietly(command, folder / "train.log").seconds
 
 
-def run_quietly(command: Sequence[str], log: Path) -> None:
-    """Run a command of this installation, whose words go to `log`."""
+def run_quietly(command: Sequence[str], log: Path) -> Any:
+    """Run a command of this installation, whose words go to `log`, and return its time and memory."""
     from thermoxels_ns.commands.installed_commands import run_command
 
     log.parent.mkdir(parents=True, exist_ok=True)
-    run_command(list(command), log)
+    return run_command(list(command), log)
 
 
 def train_and_evaluate(
