@@ -10,8 +10,9 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.demo_mesh import demo_mesh
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice, input_from_world
-from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import (
     KnownTruth,
     RenderedRays,
@@ -222,7 +223,7 @@ def exact_rays(
     directions = truth.camera.directions(pose).reshape(-1, 3) @ input_to_world[:3, :3].T * scale
     origins = np.tile(origin, (len(directions), 1))
     depth, hit = view.depth_m.ravel() / scale, view.hit.ravel()
-    ends = np.linspace(0.0, 2.0 * np.nanmax(depth[hit]), 2000)[:, None, None] * directions + origins
+    ends = np.linspace(0.0, 2.0 * np.nanmax(depth[hit]), 300)[:, None, None] * directions + origins
     index = lattice.world_to_index(ends)
     in_box = ((index >= 0) & (index <= lattice.cell_shape)).all(-1).any(0)
     return RenderedRays(origins, directions, np.where(hit, depth, 99.0), hit, in_box)
@@ -269,7 +270,7 @@ def test_surroundings_within_the_lattice_are_no_sky():
 @pytest.fixture(scope="module")
 def pipeline(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "hot"
-    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18)
+    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18, thermal_width=8)
     return train(folder, steps=0)
 
 
@@ -283,14 +284,17 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
     known = load_known_truth(pipeline.datamanager.get_datapath())
     exact = exact_snapshot(known, 48, world_to_input)
     asked = []
-    monkeypatch.setattr(
-        pipeline.model, "grid_snapshot", lambda rays, views: asked.append((len(list(rays)), len(views.size))) or exact
-    )
+
+    def snapshot(rays, views: Views) -> GridSnapshot:
+        asked.append(({int(bundle.metadata["stream"][0]) for bundle in rays}, views.size[:, 0].tolist()))
+        return exact
+
+    monkeypatch.setattr(pipeline.model, "grid_snapshot", snapshot)
     monkeypatch.setattr(pipeline, "test_mode", "test")
     averages = pipeline.get_average_eval_image_metrics(get_std=True)
     assert averages["precision"] > 0.99 and averages["recall"] > 0.95
     assert averages["surface_distance_voxels"] < 0.6
     assert averages["depth_error"] > 0.0 and 0.0 < averages["depth_off_share"] <= 1.0 and averages["sky_filled"] == 0.0
     assert "fscore_std" not in averages and "half_transparent_std" in averages
-    ((rays, views),) = asked
-    assert rays > 0 and views == len(pipeline.datamanager.train_dataset)  # what is solid is decided as in an export
+    # What is solid is decided as in an export, by the rays and cameras of both streams.
+    assert asked == [({RGB_STREAM, THERMAL_STREAM}, [24] * 8 + [8] * 8)]
