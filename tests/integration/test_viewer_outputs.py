@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import websockets
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.integration.commands import Trained
 from thermoxels_ns.synthetic.scene_truth import look_at
@@ -29,8 +30,9 @@ async def frames_of(port: int, outputs: tuple[str, ...]) -> dict[str, np.ndarray
             await asyncio.sleep(0.5)
     seen: dict[str, np.ndarray] = {}
     pose = look_at((2.0, 2.0, 1.5), (0.0, 0.0, 0.0))
+    turn = Rotation.from_matrix(pose[:3, :3] * (1.0, -1.0, -1.0))
     camera: dict[str, Any] = {
-        **{"type": "ViewerCameraMessage", "wxyz": quaternion(pose[:3, :3] * (1.0, -1.0, -1.0)), "fov": 1.0},
+        **{"type": "ViewerCameraMessage", "wxyz": np.roll(turn.as_quat(), 1).tolist(), "fov": 1.0},
         **{
             "position": pose[:3, 3].tolist(),
             "aspect": 1.3,
@@ -64,13 +66,6 @@ async def frames_of(port: int, outputs: tuple[str, ...]) -> dict[str, np.ndarray
                 picture = await until(lambda message: message["type"] == "BackgroundImageMessage")
             seen[name] = np.asarray(Image.open(io.BytesIO(picture["rgb_bytes"])))
     return seen
-
-
-def quaternion(rotation: np.ndarray) -> list[float]:
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-    return [w, x, y, z]
 
 
 def files_below(folder: Path) -> dict[Path, tuple[int, int]]:
