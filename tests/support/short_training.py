@@ -17,6 +17,13 @@ from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
+STEPS, RISES = 14, 9
+COURSE = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [4], "prune_at": [6], "thin_at": [RISES]}
+COURSE |= {"distortion_ramp": [2, 4], "view_dependence_from": RISES}
+# So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
+COURSE |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
+"""The model of a training of `STEPS` in which all happens; from `RISES` on colour depends on the direction."""
+
 
 class Training:
     """A training that can be stepped, saved and resumed at any step.

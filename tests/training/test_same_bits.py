@@ -9,26 +9,11 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.support.boxed_scene import write_boxed_scene
-from tests.support.short_training import Training
+from tests.support.short_training import COURSE, RISES, STEPS, Training
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
-
-RISES = 9
-"""Step from which colour depends on the direction."""
-STEPS = 14
-COURSE = {
-    "resolutions": [8, 16],
-    "voxel_pixels": 0.0,
-    "refine_at": [4],
-    "prune_at": [6],
-    "thin_at": [RISES],
-    "distortion_ramp": [2, 4],
-}
-# So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
-COURSE |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
-COURSE |= {"view_dependence_from": RISES}
 
 
 @pytest.fixture(scope="module")
