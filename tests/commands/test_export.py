@@ -12,7 +12,7 @@ import tyro
 from PIL import Image
 
 from tests.support.looking_cameras import looking_at
-from tests.support.unreadable import files_end_after
+from tests.support.unreadable import contents, files_end_after
 from thermoxels_ns.commands.export import (
     ExportOptions,
     ExportThermoxelsMesh,
@@ -57,10 +57,6 @@ def trained(snapshot: GridSnapshot, **more) -> TrainedScene:
 
 def read(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pyvista as pv
 import tyro
 
 from tests.support.scene_bodies import room, tagged_body, wall
-from tests.support.unreadable import files_end_after
+from tests.support.unreadable import contents, files_end_after
 from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat
 from thermoxels_ns.commands.installed_commands import command_of
@@ -145,20 +145,16 @@ def test_the_report_is_one_page_that_fetches_nothing(hour) -> None:
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(folder, hour, tmp_path, capsys, size_bytes, broken):
     shutil.copytree(hour, tmp_path / "out")
     (tmp_path / "out" / "mine.txt").write_text("mine")
-    whole = files_of(tmp_path / "out")
+    whole = contents(tmp_path / "out")
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "hour.yaml"), *PROBES]
     capsys.readouterr()
     with files_end_after(size_bytes):
         assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and broken in said and "space" in said, said
-    left = files_of(tmp_path / "out")
+    left = contents(tmp_path / "out")
     assert left.pop("mine.txt") == b"mine" and set(left) < set(whole) - {"answers.json"}
     assert {name: whole[name] for name in left} == left  # the same again, whether they are old or new
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_second_run_replaces_the_first(folder, hour) -> None:
@@ -217,10 +213,10 @@ def test_what_cannot_be_used_is_refused_and_leaves_the_old_results(folder, tmp_p
     if summary is not None:
         (tmp_path / "summary.json").write_text(json.dumps(summary))
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "answers.json").write_text("{}")
+    (tmp_path / "out" / "series.csv").write_text("old")  # marks results of this command
     with pytest.raises(ThermoxelsError, match=name):
         run_heat(Heat(tmp_path / "mesh.vtu", str(folder / scene), tmp_path / "out", **more))
-    assert files_of(tmp_path / "out") == {"answers.json": b"{}"}
+    assert contents(tmp_path / "out") == {"series.csv": b"old"}
 
 
 def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -> None:
