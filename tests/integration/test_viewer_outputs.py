@@ -31,15 +31,9 @@ async def frames_of(port: int, outputs: tuple[str, ...]) -> dict[str, np.ndarray
     seen: dict[str, np.ndarray] = {}
     pose = look_at((2.0, 2.0, 1.5), (0.0, 0.0, 0.0))
     turn = Rotation.from_matrix(pose[:3, :3] * (1.0, -1.0, -1.0))
-    camera: dict[str, Any] = {
-        **{"type": "ViewerCameraMessage", "wxyz": np.roll(turn.as_quat(), 1).tolist(), "fov": 1.0},
-        **{
-            "position": pose[:3, 3].tolist(),
-            "aspect": 1.3,
-            "look_at": [0.0, 0.0, 0.0],
-            "up_direction": [0.0, 0.0, 1.0],
-        },
-    }
+    camera: dict[str, Any] = {"type": "ViewerCameraMessage", "fov": 1.0, "aspect": 1.3, "look_at": [0.0, 0.0, 0.0]}
+    camera |= {"wxyz": np.roll(turn.as_quat(), 1).tolist(), "position": pose[:3, 3].tolist()}
+    camera |= {"up_direction": [0.0, 0.0, 1.0]}
 
     async def send(message: dict[str, Any]) -> None:
         await connection.send(msgspec.msgpack.encode(message))

@@ -32,16 +32,12 @@ def restored_threads() -> Iterator[None]:
 
 
 def begin(
-    scene: Path,
-    options: dict[str, Any] | None = None,
-    saved: bytes | None = None,
-    count: int = 1,
-    rays: int = 700,
+    scene: Path, options: dict[str, Any] = COURSE, saved: bytes | None = None, count: int = 1, rays: int = 700
 ) -> Training:
     """Begin a training, or go on with a saved one, on so many threads."""
     torch.set_num_threads(count)
     data = {"data": scene, "train_num_rays_per_batch": rays, "thermal_num_rays_per_batch": rays}
-    settings = {"cpu_threads": count, "datamanager": data, "model": COURSE if options is None else options}
+    settings = {"cpu_threads": count, "datamanager": data, "model": options}
     return Training(settings, STEPS, saved=saved)
 
 
