@@ -6,9 +6,20 @@ import pytest
 import torch
 
 from tests.support.pretended_gpu import OnGpu, pretended_gpu
-from tests.support.short_training import COURSE, STEPS, Training
+from tests.support.short_training import Training
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
+COURSE = {
+    "resolutions": [8, 16],
+    "refine_at": [6],
+    "prune_at": [8],
+    "thin_at": [10],
+    "voxel_pixels": 0.0,
+    "prune_threshold": 0.001,
+    "thin_threshold": 0.002,
+    "photo_depth": "on",
+}
+STEPS = 12
 TERMS = {"rgb_loss", "thermal_loss", "tv_density_loss", "tracks_loss", "distortion_loss", "surroundings_loss"}
 
 
@@ -20,7 +31,7 @@ def scene(tmp_path_factory):
 
 def losses_on(device: str, scene) -> tuple[list[dict[str, float]], Training]:
     rays = {"train_num_rays_per_batch": 256, "thermal_num_rays_per_batch": 256}
-    model = COURSE | {"backend": "reference", "photo_depth": "on"}
+    model = COURSE | {"backend": "reference", "view_dependence_from": 9, "distortion_ramp": [0, 4]}
     overrides = {"datamanager": {"data": scene, **rays}, "model": model, "cpu_threads": 1}
     training, found = Training(overrides, STEPS, device=device), []
     for step in range(STEPS):
