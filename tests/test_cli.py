@@ -42,15 +42,6 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
     assert f"Train with: ns-train thermoxels --data '{folder}'" in capsys.readouterr().out
 
 
-def test_bad_input_is_one_sentence_and_exit_status_2(tmp_path, capsys):
-    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 2
-    shown = capsys.readouterr()
-    assert shown.err.splitlines() == [
-        "Error: noise_k: expected a finite number of at least 0, got -1.0. Correct --noise-k."
-    ]
-    assert "Traceback" not in shown.out
-
-
 @pytest.mark.parametrize(
     ("problem", "status", "said"),
     [

@@ -72,15 +72,6 @@ def test_figures_edited_by_hand_or_of_another_version_are_found(tmp_path, capsys
     assert said in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", SHOWN)
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_a_demo_may_differ_from_the_kept_figures_by_noise_alone(name, sign):
-    noise = FIGURES["NOISE"].get(name, 0)
-    for share, found in ((0.9, 0), (1.1, 1)):
-        changed = SHOWN | {name: SHOWN[name] + sign * (share * noise or (share > 1) * 0.01)}
-        assert len(FIGURES["differences"](SHOWN, changed)) == found
-
-
 @pytest.mark.parametrize(("psnr", "status"), [(SHOWN["psnr"], 0), (SHOWN["psnr"] - 1, 1)])
 def test_a_demo_is_read_and_compared(tmp_path, capsys, monkeypatch, psnr, status):
     s = SHOWN

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from copy import deepcopy
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +14,6 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns import nerfstudio_bridge
-from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.training.pipeline import load_checkpoint
 
@@ -53,58 +53,6 @@ def test_other_commands_load_nothing_heavy(tmp_path) -> None:
     loaded = printed(tmp_path, ANOTHER_COMMAND).split()
     assert {"thermoxels_ns.nerfstudio_bridge", "thermoxels_ns.config"} <= {*loaded}
     assert [name for name in (*HEAVY, *OURS) if name in loaded] == []
-
-
-EXPORTER = """
-import tyro
-from dataclasses import dataclass
-from typing import Annotated, Union
-
-@dataclass
-class One:
-    deep: bool = False
-
-@dataclass
-class Two:
-    size: int = 1
-
-Commands = tyro.conf.FlagConversionOff[
-    Union[Annotated[One, tyro.conf.subcommand(name="one")], Annotated[Two, tyro.conf.subcommand(name="two")]]
-]
-
-def entrypoint(args):
-    return tyro.cli(Commands, args=args)
-"""
-
-
-@pytest.fixture
-def hooked(monkeypatch):
-    """Gives a function that puts a script of nerfstudio in place and hooks it, without what the script loads."""
-
-    def hook(name: str, code: str) -> ModuleType:
-        script = ModuleType(name)
-        exec(compile(code, "script.py", "exec", dont_inherit=True), vars(script))
-        monkeypatch.setitem(sys.modules, name, script)
-        nerfstudio_bridge.extend_commands()
-        return script
-
-    return hook
-
-
-def test_hook_keeps_members_and_markers(hooked, tmp_path) -> None:
-    exporter = hooked("nerfstudio.scripts.exporter", EXPORTER)
-    first = exporter.tyro
-    nerfstudio_bridge.extend_commands()
-    assert exporter.tyro is first is not tyro
-    assert exporter.entrypoint(["two", "--size", "5"]) == exporter.Two(5)
-    # FlagConversionOff: booleans take a value, for the stock subcommands and for ours.
-    assert exporter.entrypoint(["one", "--deep", "True"]) == exporter.One(True)
-    config = tmp_path / "config.yml"
-    config.write_text("method_name: probe")
-    words = ["thermoxels-mesh", "--load-config", str(config), "--output-dir", "o", "--pictures", "False"]
-    assert exporter.entrypoint(words) == ExportThermoxelsMesh(load_config=config, output_dir=Path("o"), pictures=False)
-    # Everything else is tyro's.
-    assert first.conf is tyro.conf and first.cli(exporter.Two, args=[]) == exporter.Two()
 
 
 def test_a_script_that_runs_as_a_module_is_hooked_too(monkeypatch) -> None:
@@ -150,8 +98,12 @@ def test_a_config_that_could_run_code_is_refused(tmp_path, monkeypatch, line):
 
 
 def test_configs_of_all_methods_are_read():
-    configs = list(all_methods.values())  # what they share is written once
-    assert yaml.load(yaml.dump(configs), Loader=yaml.Loader) == configs
+    configs = deepcopy(list(all_methods.values()))  # what they share is written once
+    for config in configs:
+        vars(config).pop("_folder", None)  # that of a training in the same process
+    again = yaml.load(yaml.dump(configs), Loader=yaml.Loader)
+    # Equality of dataclasses does not look at what a subclass compares by identity: look at the text as well.
+    assert again == configs and yaml.dump(again) == yaml.dump(configs)
 
 
 class Harmful:

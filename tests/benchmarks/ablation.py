@@ -23,7 +23,6 @@ elsewhere by `from ... import` has to be replaced there, where it is used; const
 replaced. An attribute that does not exist is an error before anything runs.
 """
 
-import csv
 import importlib
 import json
 import math
@@ -41,6 +40,8 @@ from typing import Any, Literal
 import numpy as np
 from measuring import (
     SHARED_DATA,
+    append_row,
+    read_rows,
     run_of,
     run_quietly,
     run_with_options,
@@ -165,7 +166,7 @@ class Ablation:
         for name in self.without:
             check_replaced(name)
         path, wanted = self.output / "ablation.csv", list[Row]()
-        known = {tuple(row[key] for key in _KEY): row for row in _read(path)}
+        known = {tuple(row[key] for key in _KEY): row for row in read_rows(path)}
         for mechanism, scene, seed in self.runs():
             key = (mechanism, scene, str(seed), self.quality, " ".join(options))
             if key not in known:
@@ -176,7 +177,7 @@ class Ablation:
                     continue
                 given = {name: f"{figures[name]:.6g}" for name in _KEPT if name in figures}
                 row = known[key] = dict.fromkeys((*_KEY, *_KEPT), "") | dict(zip(_KEY, key)) | given
-                _append(path, row)
+                append_row(path, row)
                 shown = ", ".join(f"{name} {row[name]}" for name in FIGURES if row[name])
                 print(f"{mechanism}, {scene}, seed {seed}: {shown}", flush=True)
             wanted.append(known[key])
@@ -298,25 +299,6 @@ def table_of(rows: Sequence[Row]) -> list[str]:
 
 def _median(found: Sequence[float], name: str) -> str:
     return FIGURES[name].format(statistics.median(found)) if found else ""
-
-
-def _read(path: Path) -> list[Row]:
-    """Rows that are there."""
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def _append(path: Path, row: Row) -> None:
-    """Add a row; the first one brings the names of the columns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    first = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if first:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":

@@ -23,12 +23,11 @@ the survey, and as if heat flow were steady. With --balance the formula of conve
 too, for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
-import csv
 import shutil
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +35,7 @@ from typing import Literal
 
 import numpy as np
 import tyro
-from measuring import print_head, print_row, run_of, run_quietly, trained
+from measuring import append_row, print_head, print_row, read_rows, run_of, run_quietly, trained
 
 from tests.support.audited_house import (
     CONTACT_M,
@@ -129,14 +128,8 @@ def trained_mesh(truth: Truth, stated: Conditions, folder: Path, quality: str, s
 
 def run_trained(output: Path, quality: str, seeds: int) -> None:
     """Train and audit the houses that the output folder does not have yet, and print what all say."""
-    path, done = output / "audit_truth.csv", set[tuple[str, str]]()
-    output.mkdir(parents=True, exist_ok=True)
-    columns = ["quality", "seed", "audit", "quantity", "true", "value", "low", "high"]
-    if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            done = {(row["quality"], row["seed"]) for row in csv.DictReader(file)}
-    else:
-        path.write_text(",".join(columns) + "\n", encoding="utf-8")
+    path = output / "audit_truth.csv"
+    done = {(row["quality"], row["seed"]) for row in read_rows(path)}
     for seed in range(seeds):
         if (quality, str(seed)) in done:
             continue
@@ -150,21 +143,21 @@ def run_trained(output: Path, quality: str, seeds: int) -> None:
         }
         contact = with_contact(STATED, truth, seed, CONTACT_M)
         rows = [
-            [quality, seed, f"{how}, {known}", name, true, *astuple(found)]
+            {"quality": quality, "seed": seed, "audit": f"{how}, {known}", "quantity": name, "true": true}
+            | asdict(found)
             for how, mesh in meshes.items()
             for known, conditions in (("offset", STATED), ("contact", contact))
             for name, true, found in house_findings(mesh, truth, plain, conditions)
         ]
-        with path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
+        for row in rows:
+            append_row(path, row)
         print(f"seed {seed}: done", flush=True)
-    rows: Rows = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if row["quality"] == quality:
-                found = Interval(*(float(row[name]) for name in ("value", "low", "high")))
-                rows.setdefault((row["audit"], row["quantity"]), []).append((float(row["true"]), found))
-    report(rows)
+    found_of: Rows = {}
+    for row in read_rows(path):
+        if row["quality"] == quality:
+            found = Interval(*(float(row[name]) for name in ("value", "low", "high")))
+            found_of.setdefault((row["audit"], row["quantity"]), []).append((float(row["true"]), found))
+    report(found_of)
 
 
 Rows = dict[tuple[str, str], list[tuple[float, Interval]]]

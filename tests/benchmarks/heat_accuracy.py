@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from measuring import logarithmic_panels, save, take_turns, write_rows
+from measuring import append_row, logarithmic_panels, save, take_turns
 
 from tests.support.building_corner import building_corner
 from tests.support.heat_bodies import CONCRETE, finer, nafems_t3
@@ -83,8 +83,9 @@ class HeatAccuracy:
         ):
             rows += self.steady(name, problem, finest, tolerances)
         rows += self.in_time()
-        shown = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
-        write_rows(self.output, shown)
+        self.output.unlink(missing_ok=True)
+        for row in rows:
+            append_row(self.output, {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(row).items()})
         self.draw(rows)
 
     def steady(self, name: str, given: HeatProblem, finest: int, tolerances: tuple[float, ...]) -> list[Row]:

@@ -15,10 +15,9 @@ import numpy as np
 import tyro
 from measuring import print_head, print_row
 
-from tests.support.demo_mesh import exact_snapshot
+from tests.support.demo_mesh import demo_mesh
 from tests.support.heat_bodies import CONCRETE
 from thermoxels_ns.commands.export import load_trained_scene
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -29,11 +28,6 @@ from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
 FINER = 1.5  # Lattice of the exact body against that of the reconstruction
-
-
-def exact_mesh(scene, voxels: int) -> TetMesh:
-    snapshot = exact_snapshot(scene.solid.signed_distance, Lattice.covering(*scene.scene_box, voxels))
-    return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4)).mesh
 
 
 def heat_lost_j(mesh: TetMesh) -> float:
@@ -59,7 +53,9 @@ class HeatLoss:
             known = load_known_truth(trained.scene_folder)
             if known is None:
                 raise SystemExit(f"{config}: the exact shape of this scene is not known")
-            meshes = {"exact shape": exact_mesh(known.scene, round(FINER * max(trained.snapshot.lattice.cell_shape)))}
+            meshes = {
+                "exact shape": demo_mesh(known.scene.name, round(FINER * max(trained.snapshot.lattice.cell_shape)))
+            }
             for mode in ("voxel", "conforming"):
                 built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, mode)
                 meshes[mode] = built.mesh

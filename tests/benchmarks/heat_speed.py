@@ -14,11 +14,8 @@ Times are medians, the two sides taking turns in one process; compiled kernels a
 that of a process for each side alone: its peak less what it needs after its imports.
 """
 
-import json
 import math
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -27,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from measuring import print_head, print_row, take_turns
+from measuring import in_own_process, peak_memory_bytes, print_head, print_row, take_turns
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
@@ -47,15 +44,8 @@ class HeatSpeed:
     """Length of a step, [s]."""
     repeats: int = 5
     """Runs per median."""
-    side: str = ""
-    """Internal: run this side once on the mesh in `folder` and print its peak memory."""
-    folder: Path = Path()
-    """Internal: where the mesh is."""
 
     def main(self) -> None:
-        if self.side:
-            print(json.dumps(self.peak_memory_mb()))
-            return
         print(f"\nLumped mass, {self.steps} steps of {self.step_seconds:g} s, medians of {self.repeats}\n")
         print_head(
             *("tetrahedra", "scikit-fem", "ours", "ours / scikit-fem", "per million tetrahedra"),
@@ -74,7 +64,7 @@ class HeatSpeed:
         with tempfile.TemporaryDirectory() as folder:
             np.save(Path(folder) / "points.npy", points)
             np.save(Path(folder) / "tets.npy", tets)
-            memory = {side: self.in_own_process(side, Path(folder)) for side in sides}
+            memory = {side: in_own_process(peak_memory_mb, side, Path(folder), self) for side in sides}
         ours, ours_mb = statistics.median(seconds["ours"]), memory["ours"]
         theirs = statistics.median(seconds["scikit-fem"]) if not alone else math.nan
         theirs_mb = memory.get("scikit-fem", math.nan)
@@ -84,23 +74,6 @@ class HeatSpeed:
             *(f"{1e6 * ours / len(tets):.2f} s", f"{theirs_mb:.0f} MB", f"{ours_mb:.0f} MB"),
             *(f"{ours_mb / theirs_mb:.2f}", f"{difference:.0e} K"),
         ]
-
-    def in_own_process(self, side: str, folder: Path) -> float:
-        """Peak memory of one side, [MB]."""
-        options = [f"--side={side}", f"--folder={folder}", f"--steps={self.steps}"]
-        options += [f"--step-seconds={self.step_seconds!r}"]
-        done = subprocess.run([sys.executable, __file__, *options], capture_output=True, text=True, check=True)
-        return float(json.loads(done.stdout.splitlines()[-1]))
-
-    def peak_memory_mb(self) -> float:
-        """Run one side in this process; what the imports and the kernels need does not count."""
-        run = self.ours if self.side == "ours" else self.scikit_fem
-        points, tets = cube(1)
-        run(points, tets, temperatures(points))
-        before = most_memory_kb()
-        points, tets = np.load(self.folder / "points.npy"), np.load(self.folder / "tets.npy")
-        run(points, tets, temperatures(points))
-        return (most_memory_kb() - before) / 1024.0
 
     def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray) -> np.ndarray:
         from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
@@ -142,10 +115,15 @@ class HeatSpeed:
         return np.array(states)
 
 
-def most_memory_kb() -> int:
-    """Most memory this process ever had, [kB]. Linux; what `resource` gives there includes the parent's."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+def peak_memory_mb(side: str, folder: Path, options: HeatSpeed) -> float:
+    """Run one side on the mesh in a folder; what the imports and the kernels need does not count, [MB]."""
+    run = options.ours if side == "ours" else options.scikit_fem
+    points, tets = cube(1)
+    run(points, tets, temperatures(points))
+    before = peak_memory_bytes()
+    points, tets = np.load(folder / "points.npy"), np.load(folder / "tets.npy")
+    run(points, tets, temperatures(points))
+    return (peak_memory_bytes() - before) / 2**20
 
 
 def cube(voxels: int) -> tuple[np.ndarray, np.ndarray]:

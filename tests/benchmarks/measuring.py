@@ -2,6 +2,7 @@
 
 import csv
 import json
+import multiprocessing
 import os
 import sys
 import time
@@ -55,6 +56,18 @@ def take_turns(
     return seconds, results
 
 
+def in_own_process(work: Callable[..., Any], *given: Any) -> Any:
+    """Call a function of a module in a process of its own, so that its peak memory is its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(work, given)
+
+
+def peak_memory_bytes() -> int:
+    """Most resident memory that this process ever had. Linux; what `resource` gives there includes the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+
+
 def synthetic_scene(name: str, folder: Path) -> SyntheticScene:
     """Make a synthetic scene and write it, as benchmarks photograph it, unless the folder holds it already.
 
@@ -88,18 +101,17 @@ def trained(
     """
     from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING
 
-    began = time.perf_counter()
     command = [*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"]
-    run_quietly([*command, *PLAIN_TRAINING, *options, "thermal-data", "--data", str(scene)], folder / "train.log")
-    return time.perf_counter() - began
+    command += [*PLAIN_TRAINING, *options, "thermal-data", "--data", str(scene)]
+    return run_quietly(command, folder / "train.log").seconds
 
 
-def run_quietly(command: Sequence[str], log: Path) -> None:
-    """Run a command of this installation, whose words go to `log`."""
+def run_quietly(command: Sequence[str], log: Path) -> Any:
+    """Run a command of this installation, whose words go to `log`, and return its time and memory."""
     from thermoxels_ns.commands.installed_commands import run_command
 
     log.parent.mkdir(parents=True, exist_ok=True)
-    run_command(list(command), log)
+    return run_command(list(command), log)
 
 
 def train_and_evaluate(
@@ -136,12 +148,23 @@ def print_head(*columns: str) -> None:
     print(len(columns) * "|---" + "|", flush=True)
 
 
-def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows that are there."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a row; the first one brings the names of the columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    first = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(row))
+        if first:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 def logarithmic_panels(lines: int, columns: int, **options: Any) -> tuple[Any, Any]:

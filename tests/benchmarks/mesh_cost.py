@@ -8,8 +8,6 @@ volume are known. Each case runs in a process of its own, so that its peak memor
 `build_mesh` with all tags, 40 cameras on a sphere around the body, the median of `--repeats` runs.
 """
 
-import multiprocessing
-import resource
 import statistics
 import time
 from collections.abc import Callable
@@ -21,10 +19,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import tyro
-from measuring import print_head, print_row
+from measuring import in_own_process, logarithmic_panels, peak_memory_bytes, print_head, print_row, save
 
 from tests.support.demo_mesh import exact_snapshot
 from tests.support.looking_cameras import looking_at
+from tests.support.stuffed_shapes import SHAPES
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
@@ -46,30 +45,14 @@ class Body:
     signed_distance: Callable[[Vector], Vector]
     area: float
     volume: float
-    box: Any = ((-1.1, -1.1, -1.1), (1.1, 1.1, 1.1))
+    box: Any
 
 
 def body_named(name: str) -> Body:
-    """A unit sphere, a torus around z, a box turned about y, or the exact solid of a synthetic scene."""
-    pi = np.pi
-    if name == "sphere":
-        return Body(lambda p: np.linalg.norm(p, axis=1) - 1.0, 4 * pi, 4 / 3 * pi)
-    if name == "torus":
-        large, small = 0.7, 0.3
-        return Body(
-            lambda p: np.hypot(np.hypot(p[:, 0], p[:, 1]) - large, p[:, 2]) - small,
-            4 * pi**2 * large * small,
-            2 * pi**2 * large * small**2,
-        )
-    if name == "slab at 30 degrees":
-        (a, b, c), angle = (1.6, 1.4, 0.5), np.radians(30.0)
-        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-
-        def distance(points: Vector) -> Vector:
-            q = np.abs(points @ turn) - np.array((a, b, c)) / 2
-            return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
-
-        return Body(distance, 2 * (a * b + b * c + a * c), a * b * c)
+    """One of the known shapes, or the exact solid of a synthetic scene."""
+    if name in SHAPES:
+        shape = SHAPES[name]
+        return Body(shape.distance, shape.area, shape.volume, ((-0.9, -0.9, -0.9), (0.9, 0.9, 0.9)))
     scene = make_scene(name)
     return Body(scene.solid.signed_distance, scene.solid.area, scene.solid.volume, scene.scene_box)
 
@@ -86,17 +69,17 @@ def snapshot_of(body: Body, voxels: int) -> GridSnapshot:
 
 
 def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
-    """One case; runs in a process of its own."""
+    """One case."""
     body = body_named(name)
     snapshot = snapshot_of(body, voxels)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_memory_bytes()
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
         selection = SolidSelection(density_threshold=1.0, close_gaps=0)
         built = build_mesh(snapshot, selection, np.eye(4), mode)
         seconds.append(time.perf_counter() - start)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    peak = peak_memory_bytes() - before
     mesh, quality = built.mesh, check_mesh(built.mesh)
     distance = np.abs(body.signed_distance(sample_facets(mesh.points_m, mesh.facets, 50_000)))
     # Volume of the mesh inside the body, from 35 points evenly spread over each tetrahedron.
@@ -113,7 +96,7 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
         "mode": mode,
         "tets": len(mesh.tets),
         "seconds": statistics.median(seconds),
-        "peak_mb": peak / 1024,
+        "peak_mb": peak / 2**20,
         "area_error": quality.area_m2 / body.area - 1.0,
         "volume_error": quality.volume_m3 / body.volume - 1.0,
         "hausdorff_voxels": float(distance.max()) / snapshot.lattice.voxel_size,
@@ -122,14 +105,8 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     names = list(dict.fromkeys(row["body"] for row in rows))
-    size, shared = (3.1 * len(names), 5.6), {"sharex": True, "sharey": "row"}
-    figure, panels = pyplot.subplots(2, len(names), squeeze=False, layout="constrained", figsize=size, **shared)
+    figure, panels = logarithmic_panels(2, len(names), figsize=(3.1 * len(names), 5.6), sharex=True, sharey="row")
     for (line, key), (column, name) in product(enumerate(("area_error", "volume_error")), enumerate(names)):
         panel = panels[line][column]
         for mode, colour, marker in (("conforming", "#b5367a", "o"), ("voxel", "#31688e", "s")):
@@ -138,14 +115,12 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             panel.plot(*zip(*dots), color=colour, marker=marker, label=mode) if dots else None
             for row, dot in zip(chosen, dots):
                 panel.annotate(str(row["voxels"]), dot, xytext=(4, 4), textcoords="offset points", fontsize=7)
-        panel.set(xscale="log", yscale="log")
-        panel.grid(True, which="both", alpha=0.25)
         panel.margins(x=0.2)
         panels[0][column].set_title(name)
         panels[1][column].set_xlabel("seconds")
         panels[line][0].set_ylabel(f"{key.replace('_', ' ')} [%]")
     panels[0][0].legend(fontsize=7, loc="upper right")
-    figure.savefig(path, dpi=130)
+    save(figure, path)
 
 
 @dataclass
@@ -163,12 +138,9 @@ class MeshCost:
 
     def main(self) -> None:
         rows = []
-        spawn = multiprocessing.get_context("spawn")
         print_head("body", "voxels", "boundary", "tets", "s", "MB", "area", "volume", "Hausdorff", "IoU")
         for case in product(self.bodies, self.resolutions, self.modes):
-            with spawn.Pool(1) as pool:
-                row = pool.apply(measure, (*case, self.repeats))
-            rows.append(row)
+            rows.append(row := in_own_process(measure, *case, self.repeats))
             print_row(
                 *(*case, f"{row['tets']:,}", f"{row['seconds']:.2f}", f"{row['peak_mb']:.0f}"),
                 *(f"{100 * row[name]:+.2f} %" for name in ("area_error", "volume_error")),

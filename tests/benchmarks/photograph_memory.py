@@ -4,14 +4,11 @@
 
 The drawn house is photographed at 320 x 240 pixels and enlarged, with a mask beside each photograph, so that a folder
 of 300 photographs of 12 megapixels is written in a minute or two. Both folders are trained for some steps by the
-command that a user types. Printed are the most resident memory, the seconds of the whole command, and those per step.
+command that a user types. Printed are the most resident memory and the seconds of the whole command.
 """
 
 import json
 import os
-import resource
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,30 +35,21 @@ class PhotographMemory:
     """Training steps."""
 
     def main(self) -> None:
-        print_head("photographs", "most resident memory", "seconds", "seconds per step at the end")
+        print_head("photographs", "most resident memory", "seconds")
         for width in self.widths:
             scene = self.output / f"scene-{width}"
             if not (scene / "transforms.json").is_file():
                 write_scene(make_scene("house-corner"), scene, self.frames, 6, *_SMALL, progress=False)
                 if width > _SMALL[0]:
                     _enlarge(scene, width)
-            began = time.perf_counter()
-            peak, per_step = self.train(scene)
-            seconds = time.perf_counter() - began
+            command = [
+                *("ns-train", "thermoxels", "--output-dir", str(self.output / "outputs"), "--vis", "tensorboard"),
+                *("--max-num-iterations", str(self.steps), "--logging.steps-per-log", "10"),
+                *("thermal-data", "--data", str(scene)),
+            ]
+            cost = run_quietly(command, self.output / f"{scene.name}.log")
             size = f"{self.frames} of {width} x {width * _SMALL[1] // _SMALL[0]}"
-            print_row(size, f"{peak / 1e9:.2f} GB", f"{seconds:.0f}", f"{per_step:.3f}")
-
-    def train(self, scene: Path) -> tuple[float, float]:
-        """Train; return the most resident memory, [bytes], and the seconds per step of the second half."""
-        command = [
-            *("ns-train", "thermoxels", "--output-dir", str(self.output / "outputs"), "--vis", "tensorboard"),
-            *("--max-num-iterations", str(self.steps), "--logging.steps-per-log", "10"),
-            *("thermal-data", "--data", str(scene)),
-        ]
-        log = self.output / f"{scene.name}.log"
-        run_quietly([Path(sys.executable).name, str(Path(__file__).resolve()), "--run", *command], log)
-        found = json.loads(log.read_text(encoding="utf-8").splitlines()[-1])
-        return found["peak"], found["per_step"]
+            print_row(size, f"{cost.peak_memory_gb:.2f} GB", f"{cost.seconds:.0f}")
 
 
 def _enlarge(scene: Path, width: int) -> None:
@@ -82,31 +70,6 @@ def _enlarge(scene: Path, width: int) -> None:
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def run(words: list[str]) -> None:
-    """Run ns-train in this process; write its most resident memory and seconds per step as a last line."""
-    from importlib.metadata import entry_points
-
-    (command,) = entry_points(group="console_scripts", name=words[0])
-    begin, times = command.load(), list[float]()
-    from thermoxels_ns.training.pipeline import ThermoxelsPipeline
-
-    step = ThermoxelsPipeline.get_train_loss_dict
-
-    def timed(*args, **options):
-        times.append(time.perf_counter())
-        return step(*args, **options)
-
-    ThermoxelsPipeline.get_train_loss_dict = timed
-    sys.argv = words
-    begin()
-    half = len(times) // 2
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"peak": peak, "per_step": (times[-1] - times[half]) / (len(times) - 1 - half)}), flush=True)
-
-
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    if sys.argv[1:2] == ["--run"]:
-        run(sys.argv[2:])
-    else:
-        tyro.cli(PhotographMemory).main()
+    tyro.cli(PhotographMemory).main()

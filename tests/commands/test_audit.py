@@ -286,19 +286,7 @@ def test_patches_are_proposed_taken_and_written_as_an_envelope(tmp_path, capsys)
     assert cli.main(propose) == 2 and "write_patches" in capsys.readouterr().err
     text = (configs_folder() / "house-corner-conditions.yaml").read_text()
     (tmp_path / "c.yaml").write_text(text.replace(", reveals]", "]").replace('"*-wall"', '"wall-*"'))
-    words = (
-        "--patches",
-        str(patches),
-        "--envelope",
-        "hbjson",
-        "gbxml",
-        "--north",
-        "1",
-        "0",
-        "0",
-        "--pictures",
-        "False",
-    )
+    words = ("--patches", str(patches), "--envelope", "hbjson", "gbxml", *propose[-4:], "--pictures", "False")
     answers, _ = audited(tmp_path / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", *words)
     assert {"wall-east", "roof", "ground", "door-north-1"} <= {one["name"] for one in answers["patches"]}
     assert answers["envelope"]["wall-east"]["azimuth_deg"] == pytest.approx(90.0, abs=2.0)

@@ -12,7 +12,7 @@ import pyvista as pv
 import tyro
 
 from tests.support.scene_bodies import room, tagged_body, wall
-from tests.support.unreadable import files_end_after
+from tests.support.unreadable import contents, files_end_after
 from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat
 from thermoxels_ns.commands.installed_commands import command_of
@@ -145,20 +145,16 @@ def test_the_report_is_one_page_that_fetches_nothing(hour) -> None:
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(folder, hour, tmp_path, capsys, size_bytes, broken):
     shutil.copytree(hour, tmp_path / "out")
     (tmp_path / "out" / "mine.txt").write_text("mine")
-    whole = files_of(tmp_path / "out")
+    whole = contents(tmp_path / "out")
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "hour.yaml"), *PROBES]
     capsys.readouterr()
     with files_end_after(size_bytes):
         assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and broken in said and "space" in said, said
-    left = files_of(tmp_path / "out")
+    left = contents(tmp_path / "out")
     assert left.pop("mine.txt") == b"mine" and set(left) < set(whole) - {"answers.json"}
     assert {name: whole[name] for name in left} == left  # the same again, whether they are old or new
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_second_run_replaces_the_first(folder, hour) -> None:
@@ -167,15 +163,6 @@ def test_a_second_run_replaces_the_first(folder, hour) -> None:
     assert {"heat.pvd", "heat", *HEAT_PICTURES} <= before
     run_heat(steady)
     assert sorted(path.name for path in hour.iterdir()) == ["answers.json", "heat.vtu", "report.html", "series.csv"]
-
-
-def test_a_failing_run_leaves_the_old_results(folder, tmp_path) -> None:
-    options = Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False)
-    run_heat(options)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(HeatError, match=r"^probe 1: expected"):
-        run_heat(replace(options, probes=((9.0, 9.0, 9.0),)))
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("name", ["heat.pvd", "heat/step-0001.vtu", "report.html"])
@@ -188,30 +175,48 @@ def test_files_of_others_are_not_removed(folder, tmp_path, name) -> None:
     assert (tmp_path / name).read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("summary", "name"),
-    [
-        ({"length_unit": "input unit", "up": [0, 0, 1]}, "scale of the mesh"),
-        ([1, 2], ".*summary.json"),
-        ({"up": [0, 1]}, ".*summary.json: up"),
-    ],
-)
-def test_an_export_that_cannot_be_used_is_refused(folder, tmp_path, summary, name) -> None:
-    write_mesh(tmp_path / "mesh.vtu", wall())
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(ThermoxelsError, match=f"^{name}: expected"):
-        compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out"))
-
-
-def test_the_up_of_an_export_is_used(folder, tmp_path) -> None:
+def test_what_an_export_says_of_its_mesh_is_used(folder, tmp_path) -> None:
     write_mesh(tmp_path / "mesh.vtu", wall())
     options = Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out")
-    (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "m", "up": [0, 2, 0]}))
-    assert compute_heat(options).problem.up == (0.0, 1.0, 0.0)
+    shell = {"options": {"interior": "hollow", "wall_thickness": None}, "mesh": {"volume": 3.0, "area": 60.0}}
+    (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "m", "up": [0, 2, 0], **shell}))
+    run = compute_heat(options)
+    assert run.problem.up == (0.0, 1.0, 0.0)
+    assert any(line.startswith("The mesh is a shell (--interior hollow), 0.1 m thick") for line in run.warnings)
     assert compute_heat(replace(options, up=(1.0, 0.0, 0.0))).problem.up == (1.0, 0.0, 0.0)
     lines: list[str] = []
     compute_heat(replace(options, mesh=folder / "wall" / "mesh.vtu"), lines.append)
     assert any("summary.json is missing; the mesh is taken to be in metres" in line for line in lines)
+
+
+ROOM, WALL, HOUR = "room/mesh.vtu", "wall/mesh.vtu", "hour.yaml"
+
+
+@pytest.mark.parametrize(
+    ("mesh", "scene", "more", "summary", "name"),
+    [
+        (WALL, "steady.yaml", {}, {"length_unit": "input unit", "up": [0, 0, 1]}, "^scale of the mesh: expected"),
+        (WALL, "steady.yaml", {}, [1, 2], "^.*summary.json: expected"),
+        (WALL, "steady.yaml", {}, {"up": [0, 1]}, "^.*summary.json: up: expected"),
+        (ROOM, HOUR, {"tolerance": 0.0}, None, "tolerance_k: expected"),
+        (ROOM, HOUR, {"flow_tolerance": 2.0}, None, "flow_tolerance: expected"),
+        (ROOM, HOUR, {"leave_out_below": -1.0}, None, "leave_out_below: expected"),
+        (ROOM, HOUR, {"tolerance": 0.1, "leave_out_below": 0.1}, None, "leave_out_below: expected"),
+        (ROOM, HOUR, {"memory_gb": 1e-5}, None, "memory of the heat problem: expected"),
+        (ROOM, HOUR, {"tolerance": 1e-6, "memory_gb": 0.002}, None, "Not within 1e-06 K|memory_bytes: expected"),
+        (ROOM, HOUR, {"probes": ((9.0, 9.0, 9.0),)}, None, "^probe 1: expected"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_and_leaves_the_old_results(folder, tmp_path, mesh, scene, more, summary, name):
+    for path in (folder / mesh).parent.iterdir():
+        shutil.copy(path, tmp_path)
+    if summary is not None:
+        (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "series.csv").write_text("old")  # marks results of this command
+    with pytest.raises(ThermoxelsError, match=name):
+        run_heat(Heat(tmp_path / "mesh.vtu", str(folder / scene), tmp_path / "out", **more))
+    assert contents(tmp_path / "out") == {"series.csv": b"old"}
 
 
 def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -> None:
@@ -269,22 +274,6 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
     assert "in steps chosen by the tolerance" in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("more", "name"),
-    [
-        ({"tolerance": 0.0}, "tolerance_k: expected"),
-        ({"flow_tolerance": 2.0}, "flow_tolerance: expected"),
-        ({"leave_out_below": -1.0}, "leave_out_below: expected"),
-        ({"tolerance": 0.1, "leave_out_below": 0.1}, "leave_out_below: expected"),
-        ({"memory_gb": 1e-5}, "memory of the heat problem: expected"),
-        ({"tolerance": 1e-6, "memory_gb": 0.002}, "Not within 1e-06 K|memory_bytes: expected"),
-    ],
-)
-def test_accuracy_options_that_cannot_be_used(folder, tmp_path, more, name) -> None:
-    with pytest.raises(HeatError, match=name):
-        compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), tmp_path, **more))
-
-
 def test_a_tolerance_that_does_not_fit_is_said_and_written_if_allowed(folder, tmp_path) -> None:
     options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, tolerance=1e-4, pictures=False)
     small = replace(options, memory_gb=0.003)
@@ -310,14 +299,6 @@ def test_the_command_in_the_report_is_the_one_that_was_typed() -> None:
     words = shlex.split(command_of("heat", options))
     assert words[:2] == ["thermoxels", "heat"]
     assert tyro.cli(Heat, args=words[2:], config=(tyro.conf.FlagConversionOff,)) == options
-
-
-def test_a_shell_is_warned_about(folder, tmp_path) -> None:
-    write_mesh(tmp_path / "mesh.vtu", room())
-    summary = {"length_unit": "m", "options": {"interior": "hollow", "wall_thickness": None}}
-    (tmp_path / "summary.json").write_text(json.dumps({**summary, "mesh": {"volume": 3.0, "area": 60.0}}))
-    run = compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path))
-    assert run.warnings[0].startswith("The mesh is a shell (--interior hollow), 0.1 m thick on average.")
 
 
 def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:

@@ -16,31 +16,25 @@ def screen() -> io.StringIO:
     return io.StringIO()
 
 
-def test_output_of_a_command_is_shown_and_kept(fake_command, tmp_path, screen):
-    fake_command("say", "print('it says [bold]', *sys.argv[1:]); print('\\u00b0C', file=sys.stderr)")
-    run_command(["say", "a b", "c"], tmp_path / "say.log", screen)
-    assert screen.getvalue().splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
-    assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
-
-
-def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, screen):
+def test_output_of_a_command_is_shown_while_it_runs_and_kept(fake_command, tmp_path):
     gate = tmp_path / "gate"
     # The command ends well only after its first line was shown: showing it opens the gate.
     fake_command(
-        "wait",
-        "import time\nprint('first')\n"
+        "say",
+        "print('it says [bold]', *sys.argv[1:])\n"
         f"for _ in range(200):\n    if os.path.exists({str(gate)!r}): break\n    time.sleep(0.05)\n"
-        "else: sys.exit('the gate stayed shut')\nprint('second')",
+        "else: sys.exit('the gate stayed shut')\nprint('\\u00b0C', file=sys.stderr)",
     )
 
     class Opener(io.StringIO):
         def write(self, text: str) -> int:
-            if "first" in text:
+            if "[bold]" in text:
                 gate.write_text("open")
             return super().write(text)
 
-    run_command(["wait"], tmp_path / "wait.log", seen := Opener())
-    assert seen.getvalue().splitlines()[-2:] == ["first", "second"]
+    run_command(["say", "a b", "c"], tmp_path / "say.log", seen := Opener())
+    assert seen.getvalue().splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
+    assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
 
 
 def test_memory_is_that_of_the_command(fake_command, tmp_path):

@@ -3,7 +3,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE, make_body
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
@@ -65,17 +65,3 @@ def test_adaptive_steps_pay_the_third_root_of_the_tolerance() -> None:
         solve_heat(problem("wind"), AdaptiveSteps(DURATION_S, tolerance, outputs=1)).steps for tolerance in (1.0, 1e-3)
     ]
     assert 5.0 < steps[1] / steps[0] < 15.0, steps
-
-
-def test_second_order_in_space() -> None:
-    """Against backward Euler's own decay of the continuous mode, so that only the space error is left."""
-    length = 0.8
-    rate = 3.0 * CONCRETE.diffusivity_m2_s * (np.pi / length) ** 2  # of the mode below in an insulated cube, [1 / s]
-    dt, steps, errors = 0.2 / rate, 5, []
-    for n in (4, 8, 16):
-        cosines = lambda points: 20.0 + 10.0 * np.cos(np.pi * points / length).prod(axis=1)  # noqa: E731
-        mesh = make_body(np.ones((n, n, n), bool), length / n, cosines)
-        end = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(steps, dt)).temperature_c[-1]
-        exact = 20.0 + (mesh.temperature_c - 20.0) / (1.0 + dt * rate) ** steps
-        errors.append(float(np.sqrt(np.mean((end - exact) ** 2))))
-    assert np.log2(errors[1] / errors[2]) > 1.85, errors

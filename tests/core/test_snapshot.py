@@ -3,14 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.boxed_scene import write_boxed_scene
 from tests.support.looking_cameras import looking_at
-from tests.support.short_training import train
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
-from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
 def full() -> GridSnapshot:
@@ -45,28 +41,6 @@ def test_what_cannot_be_is_refused_by_name(part):
     for name in ("voxel_density", "colour"):
         with pytest.raises(MeshError, match=f"^grid snapshot {name}: expected shape"):
             replace(full(), **{name: np.ones((2, 3, 4), np.float32)})
-
-
-def test_a_pipeline_fills_evidence_and_views_from_both_streams(tmp_path):
-    scene = tmp_path / "scene"
-    write_boxed_scene(make_scene("sphere"), scene, 6, 2, width=24, height=18, thermal_width=8)
-    pipeline = train(scene, 20)
-    snapshot = pipeline.grid_snapshot()
-    evidence, views = snapshot.evidence, snapshot.views
-    assert evidence is not None and views is not None and snapshot.colour is not None
-    assert views.size[:, 0].tolist() == [24] * 6 + [8] * 6
-    model, opacity = pipeline.model, {}
-    for stream in (RGB_STREAM, THERMAL_STREAM):
-        bundles = pipeline.datamanager.training_rays(stream)  # type: ignore[attr-defined]
-        opacity[stream] = sum(
-            float(1 - t) for b in bundles for t in model.sample_rays(b.origins, b.directions).transmittance
-        )
-    assert min(opacity.values()) > 1.0
-    assert evidence.voxel_weight.sum() == pytest.approx(sum(opacity.values()), rel=1e-4)
-    assert snapshot.observed_weight.sum() <= opacity[THERMAL_STREAM] * (1 + 1e-5)
-    lo, hi = np.array(snapshot.lattice.lo), np.array(snapshot.lattice.hi)
-    towards = 0.5 * (lo + hi) - views.camera_to_world[:, :, 3]
-    assert (np.einsum("ni,ni->n", towards, -views.camera_to_world[:, :, 2]) > 0).all()  # they look at the box
 
 
 def test_what_is_shown_well_ends_where_pixels_per_area_fall_off():

@@ -1,14 +1,18 @@
 import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.boxed_scene import write_boxed_scene
+from tests.support.demo_mesh import demo_mesh
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice, input_from_world
-from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import (
     KnownTruth,
     RenderedRays,
@@ -17,7 +21,6 @@ from thermoxels_ns.evaluation.truth_comparison import (
     geometry_metrics,
     load_known_truth,
 )
-from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.interior import cavities
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
@@ -25,6 +28,8 @@ from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 IDENTITY = np.eye(4)
+MIRRORED = np.array([[0.0, -0.5, 0.0, 0.3], [0.5, 0.0, 0.0, -0.1], [0.0, 0.0, -0.5, 0.2], [0.0, 0.0, 0.0, 1.0]])
+"""To the input coordinates of a world that is a mirror image, turned about z and twice as large."""
 
 
 def known(name: str, cameras: int = 12, width: int = 64) -> KnownTruth:
@@ -42,67 +47,51 @@ def sphere() -> KnownTruth:
     return known("sphere")
 
 
-def exact_cells(truth: KnownTruth, resolution: int = 24) -> tuple[np.ndarray, Lattice]:
-    lattice = Lattice.covering(*truth.scene.scene_box, resolution)
-    centres = lattice.cell_centres().reshape(-1, 3)
-    return truth.scene.solid.contains(centres).reshape(lattice.cell_shape), lattice
+def exact_snapshot(truth: KnownTruth, resolution: int, world_to_input: np.ndarray = IDENTITY) -> GridSnapshot:
+    """The exact scene on a lattice in the trained world: opaque where it is solid."""
+    input_to_world = np.linalg.inv(world_to_input)
+    lo, hi = (np.asarray(end) for end in truth.scene.scene_box)
+    ends = np.array([[(lo, hi)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
+    ends = ends @ input_to_world[:3, :3].T + input_to_world[:3, 3]
+    lattice = Lattice.covering(ends.min(axis=0), ends.max(axis=0), resolution)
+    centres = lattice.cell_centres().reshape(-1, 3) @ world_to_input[:3, :3].T + world_to_input[:3, 3]
+    solid = truth.scene.solid.contains(centres).reshape(lattice.cell_shape)
+    corner = np.zeros(lattice.shape, dtype=np.float32)
+    return GridSnapshot(lattice, corner, corner, corner, (solid * 2.0 / lattice.voxel_size).astype(np.float32))
 
 
-def exact_mesh(
-    truth: KnownTruth, world_to_metres: np.ndarray = IDENTITY, observed: float = 5.0, just_inside: bool = False
-):
-    """Mesh of all voxels that reach into the body, or of those whose centre lies in it; exact temperatures."""
-    cells, lattice = exact_cells(truth)
-    corners = lattice.corner_positions().reshape(-1, 3)
-    density = -truth.scene.solid.signed_distance(corners).reshape(lattice.shape)
-    snapshot = GridSnapshot(
-        lattice,
-        np.maximum(density, 0.0).astype(np.float32),
-        truth.scene.surface_temperature_c(corners).reshape(lattice.shape).astype(np.float32),
-        np.full(lattice.shape, observed, dtype=np.float32),
-        cells.astype(np.float32) if just_inside else None,
-    )
-    selection = SolidSelection(close_gaps=0, density_threshold=1e-6, region="all")
-    return build_mesh(snapshot, selection, world_to_metres, "voxel").mesh, cells, lattice
+def compared(
+    truth: KnownTruth | Path, snapshot: GridSnapshot, world_to_input: np.ndarray = IDENTITY, *mesh: Any
+) -> dict:
+    """Figures of all solid voxels, and of a mesh of them with its metres per unit."""
+    found = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, world_to_input, truth, *mesh)
+    assert found is not None
+    return found
 
 
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
-    cells, lattice = exact_cells(hot_object, 24)
-    plain = compare_with_truth(cells, lattice, IDENTITY, hot_object)
-    # The same voxels, turned by 90 degrees around z and counted downwards: a turned mirror image.
-    world_to_truth = np.array(
-        [[0.0, -0.5, 0.0, 0.3], [0.5, 0.0, 0.0, -0.1], [0.0, 0.0, -0.5, 0.2], [0.0, 0.0, 0.0, 1.0]]
-    )
-    turned = np.ascontiguousarray(cells[::-1, :, ::-1].transpose(1, 0, 2))
-    nx, ny, nz = lattice.shape
-    ends = np.array([lattice.hi[0], lattice.lo[1], lattice.hi[2]])
-    lo = (np.linalg.inv(world_to_truth) @ np.append(ends, 1.0))[:3]
-    other = Lattice(tuple(lo), lattice.voxel_size / 0.5, (ny, nx, nz))
-    assert compare_with_truth(turned, other, world_to_truth, hot_object) == pytest.approx(plain, abs=2e-3)
+    plain = compared(hot_object, exact_snapshot(hot_object, 24))
+    assert compared(hot_object, exact_snapshot(hot_object, 24, MIRRORED), MIRRORED) == pytest.approx(plain, abs=2e-3)
 
 
 def test_a_mesh_in_metres_is_compared_in_those_of_the_scene(hot_object):
-    mesh, cells, lattice = exact_mesh(hot_object)
+    snapshot, mesh = exact_snapshot(hot_object, 24), demo_mesh("hot-object", 24, "voxel")
     scaled = replace(mesh, points_m=3.0 * mesh.points_m)
-    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
-    plain = compare_with_truth(cells, lattice, IDENTITY, hot_object, mesh)
-    assert result == pytest.approx(plain)
+    plain = compared(hot_object, snapshot, IDENTITY, mesh)
+    assert compared(hot_object, snapshot, IDENTITY, scaled, 3.0) == pytest.approx(plain)
     volume = float(signed_volumes(mesh.points_m, mesh.tets).sum())
     assert plain["mesh_volume_m3"] == pytest.approx(volume)
     warmer = replace(mesh, temperature_c=mesh.temperature_c + 50.0)
-    off_k = compare_with_truth(cells, lattice, IDENTITY, hot_object, warmer)["temperature_seen_mae_c"]
+    off_k = compared(hot_object, snapshot, IDENTITY, warmer)["temperature_seen_mae_c"]
     assert off_k == pytest.approx(50.0, abs=plain["temperature_seen_mae_c"] + 1e-6)
 
 
 def test_surfaces_that_few_training_cameras_see_are_not_asked_for(hot_object):
     # Nobody sees the table's underside, three tenths of the scene's surface.
-    cells, lattice = exact_cells(hot_object, 40)
-    seen = compare_with_truth(cells, lattice, IDENTITY, hot_object)["true_points_seen"]
-    everywhere = hot_object.scene.solid.surface_points(20_000, 0)[0]
-    assert seen < 0.8 * len(everywhere)
-    two = replace(hot_object, training_poses=hot_object.training_poses[:2])
+    seen = compared(hot_object, snapshot := exact_snapshot(hot_object, 40))["true_points_seen"]
+    assert seen < 0.8 * len(hot_object.scene.solid.surface_points(20_000, 0)[0])
     with pytest.raises(SceneError):
-        compare_with_truth(cells, lattice, IDENTITY, two)
+        compared(replace(hot_object, training_poses=hot_object.training_poses[:2]), snapshot)
 
 
 def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
@@ -114,9 +103,8 @@ def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
     assert known.camera == scene.camera(16, 12)
     from_json = load_known_truth(tmp_path / "transforms.json")
     np.testing.assert_array_equal(from_json.training_poses, known.training_poses)
-    cells, lattice = exact_cells(known, 16)
-    by_folder = compare_with_truth(cells, lattice, IDENTITY, tmp_path)
-    assert by_folder == compare_with_truth(cells, lattice, IDENTITY, known)
+    by_folder = compared(tmp_path, snapshot := exact_snapshot(known, 16))
+    assert by_folder == compared(known, snapshot)
     assert json.loads(json.dumps(by_folder)) == by_folder
     content = json.loads((tmp_path / "transforms.json").read_text())
     content["frames"] = content["frames"][5:]
@@ -126,9 +114,8 @@ def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
 
 
 def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sphere) -> None:
-    truth = sphere
-    mesh, cells, lattice = exact_mesh(truth, just_inside=True)
-    result = compare_with_truth(cells, lattice, IDENTITY, truth, mesh)
+    snapshot = exact_snapshot(sphere, 24)
+    lattice, result = snapshot.lattice, compared(sphere, snapshot, IDENTITY, demo_mesh("sphere", 24, "voxel"))
     assert result["precision"] == 1.0 and result["recall"] > 0.99
     assert result["mean_distance_m"] == pytest.approx(result["mean_distance_voxels"] * lattice.voxel_size)
     assert result["mean_distance_voxels"] < 0.5 and result["voxel_size_m"] == lattice.voxel_size
@@ -172,33 +159,20 @@ def test_the_solid_of_a_perfectly_trained_scene_is_the_scene(name, resolution, l
 def test_a_room_in_which_cameras_stand_is_scored_from_inside():
     """Its walls are seen from the room alone, whose air must not be filled as that of a cavity is."""
     truth = known("living-room", 24, 160)
-    lattice = Lattice.covering(*truth.scene.scene_box, 96)
-    cells = truth.scene.solid.contains(lattice.cell_centres().reshape(-1, 3)).reshape(lattice.cell_shape)
+    snapshot = exact_snapshot(truth, 96)
+    cells = snapshot.voxel_density > 0
     assert cavities(cells, np.zeros_like(cells))[0].mean() > 0.4  # closed on all sides
-    result = compare_with_truth(cells, lattice, IDENTITY, truth)
+    result = compared(truth, snapshot)
     assert result["fscore_seen"] > 0.97 and result["recall_seen"] > 0.97
 
 
 SCORES = ("fscore", "precision", "recall")
 
 
-def exact_snapshot(truth: KnownTruth, resolution: int, world_to_input: np.ndarray = IDENTITY) -> GridSnapshot:
-    """The exact scene on a lattice in the trained world: opaque where it is solid."""
-    input_to_world = np.linalg.inv(world_to_input)
-    lo, hi = (np.asarray(end) for end in truth.scene.scene_box)
-    ends = np.array([[(lo, hi)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
-    ends = ends @ input_to_world[:3, :3].T + input_to_world[:3, 3]
-    lattice = Lattice.covering(ends.min(axis=0), ends.max(axis=0), resolution)
-    centres = lattice.cell_centres().reshape(-1, 3) @ world_to_input[:3, :3].T + world_to_input[:3, 3]
-    solid = truth.scene.solid.contains(centres).reshape(lattice.cell_shape)
-    corner = np.zeros(lattice.shape, dtype=np.float32)
-    return GridSnapshot(lattice, corner, corner, corner, (solid * 2.0 / lattice.voxel_size).astype(np.float32))
-
-
 def test_the_figures_are_those_of_the_export(sphere):
     snapshot = exact_snapshot(sphere, 24)
     result = geometry_metrics(snapshot, IDENTITY, sphere)
-    exported = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, IDENTITY, sphere)
+    exported = compared(sphere, snapshot)
     assert {name: result[name] for name in SCORES} == {name: exported[name] for name in SCORES}
     assert result["surface_distance_voxels"] == pytest.approx(exported["mean_distance_voxels"])
     assert result["surface_distance_m"] == pytest.approx(exported["mean_distance_m"])
@@ -249,16 +223,13 @@ def exact_rays(
     directions = truth.camera.directions(pose).reshape(-1, 3) @ input_to_world[:3, :3].T * scale
     origins = np.tile(origin, (len(directions), 1))
     depth, hit = view.depth_m.ravel() / scale, view.hit.ravel()
-    ends = np.linspace(0.0, 2.0 * np.nanmax(depth[hit]), 2000)[:, None, None] * directions + origins
+    ends = np.linspace(0.0, 2.0 * np.nanmax(depth[hit]), 300)[:, None, None] * directions + origins
     index = lattice.world_to_index(ends)
     in_box = ((index >= 0) & (index <= lattice.cell_shape)).all(-1).any(0)
     return RenderedRays(origins, directions, np.where(hit, depth, 99.0), hit, in_box)
 
 
-TURNED = np.array([[0.0, -0.5, 0.0, 0.3], [0.5, 0.0, 0.0, -0.1], [0.0, 0.0, 0.5, 0.2], [0.0, 0.0, 0.0, 1.0]])
-
-
-@pytest.mark.parametrize("world_to_input", [IDENTITY, TURNED])
+@pytest.mark.parametrize("world_to_input", [IDENTITY, MIRRORED])
 def test_exact_depths_have_no_error_in_any_world(sphere, world_to_input):
     lattice = exact_snapshot(sphere, 16, world_to_input).lattice
     frames = [exact_rays(sphere, pose, lattice, world_to_input) for pose in sphere.scene.poses(12, 2)[1]]
@@ -299,7 +270,7 @@ def test_surroundings_within_the_lattice_are_no_sky():
 @pytest.fixture(scope="module")
 def pipeline(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "hot"
-    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18)
+    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18, thermal_width=8)
     return train(folder, steps=0)
 
 
@@ -313,14 +284,17 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
     known = load_known_truth(pipeline.datamanager.get_datapath())
     exact = exact_snapshot(known, 48, world_to_input)
     asked = []
-    monkeypatch.setattr(
-        pipeline.model, "grid_snapshot", lambda rays, views: asked.append((len(list(rays)), len(views.size))) or exact
-    )
+
+    def snapshot(rays, views: Views) -> GridSnapshot:
+        asked.append(({int(bundle.metadata["stream"][0]) for bundle in rays}, views.size[:, 0].tolist()))
+        return exact
+
+    monkeypatch.setattr(pipeline.model, "grid_snapshot", snapshot)
     monkeypatch.setattr(pipeline, "test_mode", "test")
     averages = pipeline.get_average_eval_image_metrics(get_std=True)
     assert averages["precision"] > 0.99 and averages["recall"] > 0.95
     assert averages["surface_distance_voxels"] < 0.6
     assert averages["depth_error"] > 0.0 and 0.0 < averages["depth_off_share"] <= 1.0 and averages["sky_filled"] == 0.0
     assert "fscore_std" not in averages and "half_transparent_std" in averages
-    ((rays, views),) = asked
-    assert rays > 0 and views == len(pipeline.datamanager.train_dataset)  # what is solid is decided as in an export
+    # What is solid is decided as in an export, by the rays and cameras of both streams.
+    assert asked == [({RGB_STREAM, THERMAL_STREAM}, [24] * 8 + [8] * 8)]

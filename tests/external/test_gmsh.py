@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import meshio
 import numpy as np
 import pytest
@@ -19,18 +17,6 @@ def groups(file: meshio.Mesh) -> dict[tuple[str, int], int]:
             key = (numbers[tag, block.dim], block.dim)
             found[key] = found.get(key, 0) + int(count)
     return found
-
-
-def element_tags(path: Path) -> list[int]:
-    """Tags of all elements of a text file, in its order."""
-    text = path.read_text(encoding="utf-8")
-    lines = text[text.index("$Elements") : text.index("$EndElements")].splitlines()[2:]
-    tags: list[int] = []
-    while lines:
-        count = int(lines[0].split()[3])
-        tags += [int(line.split()[0]) for line in lines[1 : count + 1]]
-        lines = lines[count + 1 :]
-    return tags
 
 
 def test_gmsh_finds_no_fault(tmp_path, solid_mesh, program, run_in):
@@ -68,8 +54,6 @@ def test_gmsh_keeps_the_physical_groups_when_it_saves_what_it_read(tmp_path, sol
     order = np.argsort(solid_mesh.region, kind="stable")
     ours = solid_mesh.points_m[solid_mesh.tets[order]]
     assert np.abs(again.points[tets] - ours).max() < 1e-14
-    expected = [*(np.argsort(boundary.patch, kind="stable") + len(tets)), *order]
-    assert np.array_equal(element_tags(tmp_path / "again.msh"), np.array(expected) + 1)
 
 
 def test_gmsh_shows_the_temperatures(tmp_path, solid_mesh, program, run_in):

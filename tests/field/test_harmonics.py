@@ -41,17 +41,6 @@ def test_sphere_image_is_continuous_across_its_seam_and_at_the_poles():
     assert torch.isfinite(image(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0000001]]))).all()
 
 
-def test_sphere_image_gradient():
-    image = SphereImage(4).double()
-    directions = torch.nn.functional.normalize(torch.randn(10, 3, dtype=torch.float64), dim=-1)
-    parameter = torch.randn(4, 8, 3, dtype=torch.float64, requires_grad=True)
-
-    def seen(values):
-        return torch.func.functional_call(image, {"image": values}, (directions,))
-
-    assert torch.autograd.gradcheck(seen, (parameter,))
-
-
 @pytest.mark.parametrize("make", [SphereImage, SkyTemperature])
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_rays_that_want_nothing_see_nothing_and_the_others_the_same_bits(make, share):

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 
-from tests.integration.commands import SHORT_TRAINING, Trained, fail, succeed
+from tests.integration.commands import SHORT_TRAINING, Trained, fail
 
 
 def lose_partner(scene: Path) -> None:
@@ -47,14 +47,10 @@ def test_an_export_of_nothing_or_into_a_file(trained: Trained, tmp_path):
     assert "output folder: expected" in export(trained.config, tmp_path / "file" / "export")
 
 
-def test_checkpoint_of_another_method(trained: Trained, tmp_path):
+def test_checkpoint_of_another_method(trained: Trained, thermal_trained: Trained, tmp_path):
     """The config of the thermal baseline beside a checkpoint of thermoxels."""
-    folder = tmp_path / "outputs" / "tiny" / "plenoxels-t" / "run"
-    succeed(
-        *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path / "outputs"), "--experiment-name", "tiny"),
-        *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "2", "--pipeline.model.refine-at", "50"),
-        *("thermal-data", "--data", str(trained.scene)),
-    )
+    folder = tmp_path / "run"
+    shutil.copytree(thermal_trained.run_folder, folder)
     shutil.copy(trained.checkpoints / "step-000000039.ckpt", folder / "nerfstudio_models")
     assert "checkpoint: expected a voxel grid" in export(folder / "config.yml", tmp_path / "export")
     evaluate = ("ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json"))

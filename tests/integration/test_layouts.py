@@ -30,7 +30,7 @@ def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     out = tmp_path / "mesh"
     succeed(
         *("ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(out)),
-        *("--metres-per-unit", "1", "--formats", "vtu", "xdmf", "msh", "glb"),
+        *("--metres-per-unit", "1", "--formats", "vtu", "xdmf", "msh", "glb", "--pictures", "False"),
     )
     mesh, summary = read_mesh(out / "mesh.vtu"), json.loads((out / "summary.json").read_text())
     assert mesh.has_temperatures == (summary["mesh"]["temperature_c"] is not None) == warm and mesh.colour is not None

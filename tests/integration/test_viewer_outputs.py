@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import websockets
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.integration.commands import Trained
 from thermoxels_ns.synthetic.scene_truth import look_at
@@ -29,15 +30,10 @@ async def frames_of(port: int, outputs: tuple[str, ...]) -> dict[str, np.ndarray
             await asyncio.sleep(0.5)
     seen: dict[str, np.ndarray] = {}
     pose = look_at((2.0, 2.0, 1.5), (0.0, 0.0, 0.0))
-    camera: dict[str, Any] = {
-        **{"type": "ViewerCameraMessage", "wxyz": quaternion(pose[:3, :3] * (1.0, -1.0, -1.0)), "fov": 1.0},
-        **{
-            "position": pose[:3, 3].tolist(),
-            "aspect": 1.3,
-            "look_at": [0.0, 0.0, 0.0],
-            "up_direction": [0.0, 0.0, 1.0],
-        },
-    }
+    turn = Rotation.from_matrix(pose[:3, :3] * (1.0, -1.0, -1.0))
+    camera: dict[str, Any] = {"type": "ViewerCameraMessage", "fov": 1.0, "aspect": 1.3, "look_at": [0.0, 0.0, 0.0]}
+    camera |= {"wxyz": np.roll(turn.as_quat(), 1).tolist(), "position": pose[:3, 3].tolist()}
+    camera |= {"up_direction": [0.0, 0.0, 1.0]}
 
     async def send(message: dict[str, Any]) -> None:
         await connection.send(msgspec.msgpack.encode(message))
@@ -64,13 +60,6 @@ async def frames_of(port: int, outputs: tuple[str, ...]) -> dict[str, np.ndarray
                 picture = await until(lambda message: message["type"] == "BackgroundImageMessage")
             seen[name] = np.asarray(Image.open(io.BytesIO(picture["rgb_bytes"])))
     return seen
-
-
-def quaternion(rotation: np.ndarray) -> list[float]:
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-    return [w, x, y, z]
 
 
 def files_below(folder: Path) -> dict[Path, tuple[int, int]]:

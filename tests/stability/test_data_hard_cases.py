@@ -55,15 +55,6 @@ def test_bad_pixels_are_masked_and_the_rest_is_unchanged(scene_folder, tmp_path_
     assert f"{report.nan} NaN" in " ".join(capsys.readouterr().out.split())
 
 
-def test_constant_scene(scene_folder):
-    """Minimum equals maximum: the range opens to 1 K and every target is one half."""
-    scene = scene_folder(suffix=".npy", bounds=False, counts=lambda i, s: np.full(s, 20.0, np.float32))
-    served = manager(scene.path)
-    _, batch = served.next_train(0)
-    assert (batch["thermal"] == 0.5).all()
-    assert served.train_dataset.temperature_range.to_celsius(0.5) == 20.0
-
-
 def test_no_valid_pixel_becomes_nan_in_a_narrow_range(scene_folder):
     """0.05 K of contrast at 1500 C: the steps that float32 degrees can hold survive the normalisation."""
     values = lambda i, s: np.float32(1500.0) + np.float32(2**-13) * np.arange(s[0] * s[1]).reshape(s)  # noqa: E731

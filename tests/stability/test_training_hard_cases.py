@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from tests.support.boxed_scene import write_boxed_scene
-from tests.support.short_training import train
+from tests.support.short_training import COURSE, STEPS, train
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -65,22 +65,12 @@ def test_image_without_a_valid_thermal_pixel_in_evaluation_does_not_spoil_the_av
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["thermal_psnr"])
 
 
-SCHEDULE = {
-    "resolutions": [8, 16],
-    "voxel_pixels": 0.0,
-    "refine_at": [30],
-    "prune_at": [50],
-    "thin_at": [60],
-    "distortion_ramp": [5, 20],
-}
-
-
 @pytest.mark.parametrize(("recipe", "rate"), [("default", 1e6), ("paper", 100.0)])
 def test_learning_rates_far_too_large_end_in_a_finite_model_or_a_clear_error(tmp_path, recipe, rate):
     scene = sphere(tmp_path / "scene")
     activation = "exp" if recipe == "default" else "relu"
     try:
-        pipeline = train(scene, 70, {**SCHEDULE, "recipe": recipe, "density_activation": activation}, rate=rate)
+        pipeline = train(scene, STEPS, COURSE | {"recipe": recipe, "density_activation": activation}, rate=rate)
     except ThermoxelsError as error:
         assert "--pipeline.model" in str(error) or "learning rate" in str(error)
         return
@@ -114,7 +104,7 @@ def test_scenes_that_show_little(tmp_path, change, views):
     transforms = json.loads((scene / "transforms.json").read_text())
     change(scene, transforms["frames"])
     (scene / "transforms.json").write_text(json.dumps(transforms))
-    pipeline = train(scene, 70, SCHEDULE)
+    pipeline = train(scene, STEPS, COURSE)
     assert pipeline.model.grid.lattice.cell_shape[0] == 16 and all_finite(pipeline)
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["psnr"])

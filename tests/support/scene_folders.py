@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from thermoxels_ns.synthetic.scene_truth import look_at
+
 
 @dataclass
 class Folder:
@@ -37,13 +39,7 @@ class Folder:
 
 def look_at_origin(angle: float, radius: float = 4.0, height: float = 1.0) -> np.ndarray:
     """Camera-to-world in OpenGL axes on a circle around the z axis."""
-    position = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-    back = position / np.linalg.norm(position)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.column_stack([right, np.cross(back, right), back, position])
-    return pose
+    return look_at((radius * np.cos(angle), radius * np.sin(angle), height), (0.0, 0.0, 0.0))
 
 
 def write_counts(path: Path, counts: np.ndarray) -> None:

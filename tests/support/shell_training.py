@@ -5,6 +5,7 @@ A script, so that a test can look at a process that does nothing else.
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,8 +21,8 @@ from thermoxels_ns.training.optimizers import RowAdam
 
 def resident(kind: str) -> int:
     """Resident memory of this process: VmRSS now, VmHWM at its peak."""
-    with open("/proc/self/status", encoding="ascii") as status:
-        return next(1024 * int(line.split()[1]) for line in status if line.startswith(kind))
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(kind))
 
 
 def keep_shell(grid: VoxelGrid, share: float):
@@ -32,11 +33,11 @@ def keep_shell(grid: VoxelGrid, share: float):
     return prune(grid, distance <= np.partition(distance, int(share * shape.prod()) - 1)[int(share * shape.prod()) - 1])
 
 
-def main(resolution: int, share: float, sh_degree: int) -> None:
+def main(resolution: int, share: float) -> None:
     """Refine to the resolution as a training does, with optimiser state, and take a step there."""
     torch.set_num_threads(1)
     imports = resident("VmRSS")
-    grid = VoxelGrid(Lattice.covering((-1, -1, -1), (1, 1, 1), 64), sh_degree, activation="exp", start_density=1.0)
+    grid = VoxelGrid(Lattice.covering((-1, -1, -1), (1, 1, 1), 64), 2, activation="exp", start_density=1.0)
     optimizers = {name: RowAdam([p], lr=1e-3) for name, p in grid.row_parameters().items()}
     generator = torch.Generator().manual_seed(0)
 
@@ -49,13 +50,11 @@ def main(resolution: int, share: float, sh_degree: int) -> None:
     def step() -> MemoryNeed:
         wants_rgb = torch.arange(8192) < 4096
         origins = torch.nn.functional.normalize(torch.randn(8192, 3, generator=generator), dim=-1) * 3.0
-        aims = torch.randn(8192, 3, generator=generator) * 0.3
-        directions = torch.nn.functional.normalize(aims - origins, dim=-1)
+        directions = torch.nn.functional.normalize(0.3 * torch.randn(8192, 3, generator=generator) - origins, dim=-1)
         variation = {name: (0, max(1, len(grid.voxels) // 10)) for name in grid.row_parameters()}
         options = RenderOptions(distortion_scale=2.0, early_stop=1e-5, variation=variation)
         seen = fused_render(grid, RayRequest(origins, directions, 0.0, None, wants_rgb, ~wants_rgb), options)
-        loss = seen.rgb.sum() + seen.thermal.sum() + seen.distortion.sum() + sum(seen.variation.values())
-        loss.backward()
+        (seen.rgb.sum() + seen.thermal.sum() + seen.distortion.sum() + sum(seen.variation.values())).backward()
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad()
@@ -68,11 +67,10 @@ def main(resolution: int, share: float, sh_degree: int) -> None:
         change(lambda: refine(grid, 2))
         most = max(most, step().gigabytes)
     change(lambda: keep_shell(grid, share))
-    need, voxels, shape = step(), grid.voxels, grid.lattice.cell_shape
-    figures = {"imports": imports, "peak": resident("VmHWM"), "most_predicted": most * 1e9, "predicted_rows": need.rows}
-    shown = {"rows": voxels.num_rows, "share": len(voxels) / float(np.prod(shape)), "resolution": shape[0]}
-    print(json.dumps(figures | shown))
+    need, voxels = step(), grid.voxels
+    taken = {"taken": resident("VmHWM") - imports, "most_predicted": most * 1e9}
+    print(json.dumps(taken | {"rows": voxels.num_rows, "predicted_rows": need.rows}))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), float(sys.argv[2]), *map(int, sys.argv[3:]))
+    main(int(sys.argv[1]), float(sys.argv[2]))

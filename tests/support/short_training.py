@@ -17,6 +17,13 @@ from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
+STEPS, RISES = 14, 9
+COURSE = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [4], "prune_at": [6], "thin_at": [RISES]}
+COURSE |= {"distortion_ramp": [2, 4], "view_dependence_from": RISES}
+# So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
+COURSE |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
+"""The model of a training of `STEPS` in which all happens; from `RISES` on colour depends on the direction."""
+
 
 class Training:
     """A training that can be stepped, saved and resumed at any step.
@@ -86,32 +93,19 @@ class Training:
         return file.getvalue()
 
 
-def train(scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0):
-    """Train the default method on a scene at 16 voxels, or as `model` says, and return its pipeline."""
-    return train_with_optimizers(scene, steps, model, rays, rate)[0]
-
-
-def train_with_optimizers(
-    scene: Path,
-    steps: int,
-    model: dict[str, Any] | None = None,
-    rays: int = 512,
-    rate: float = 1.0,
-    threads: int | None = 1,
-) -> tuple[ThermoxelsPipeline, Optimizers]:
-    """The same, and return the optimisers too.
+def train(
+    scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0
+) -> ThermoxelsPipeline:
+    """Train the default method on a scene on one thread, and return its pipeline.
 
     Args:
         scene: Scene folder.
         steps: Training steps.
-        model: Overrides of the model's configuration; lattice changes happen where it says so.
+        model: Overrides of the model's configuration: 16 voxels, and changes of the lattice where it says so.
         rays: Rays of each stream per step.
         rate: Factor on all learning rates.
-        threads: Threads of the compiled kernels.
     """
     plain = {"resolutions": [16], "refine_at": [], "prune_at": [], "thin_at": []}
     data = {"data": scene, "train_num_rays_per_batch": rays, "thermal_num_rays_per_batch": rays}
-    overrides = {"cpu_threads": threads, "datamanager": data, "model": plain | (model or {})}
-    training = Training(overrides, steps, rate=rate).advance(steps)
-    training.pipeline.eval()
-    return training.pipeline, training.optimizers
+    overrides = {"cpu_threads": 1, "datamanager": data, "model": plain | (model or {})}
+    return Training(overrides, steps, rate=rate).advance(steps).pipeline.eval()

@@ -1,4 +1,4 @@
-"""Files that may not be read, also for root, and a disk that is full."""
+"""What a folder holds, files that may not be read, also for root, and a disk that is full."""
 
 import builtins
 import errno
@@ -9,6 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Content of all files of a folder by their paths in it."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def forbid(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:

@@ -16,17 +16,8 @@ ASKED = {"photo_depth": "on"}
 
 
 def scene(folder: Path, flaws: Imperfections, own_thermal_camera: bool = False) -> Path:
-    return write_scene(
-        make_scene("house-corner"),
-        folder / "scene",
-        16,
-        2,
-        240,
-        180,
-        imperfections=flaws,
-        own_thermal_camera=own_thermal_camera,
-        progress=False,
-    )
+    options = {"imperfections": flaws, "own_thermal_camera": own_thermal_camera, "progress": False}
+    return write_scene(make_scene("house-corner"), folder / "scene", 16, 2, 240, 180, **options)
 
 
 def truth_of(folder: Path, key: str, names) -> np.ndarray:

@@ -120,19 +120,6 @@ def test_a_wall_in_place_costs_nothing_and_one_before_or_behind_it_everything(ba
     assert wall(0.7, backend) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_gradient_thins_what_is_before_the_points_and_thickens_what_is_at_them() -> None:
-    grid = VoxelGrid(LATTICE, sh_degree=0, activation="relu", start_density=0.5)
-    request = track_rays()[0].request(32, 0.0, LATTICE.voxel_size, torch.Generator().manual_seed(0), CPU)
-    seen = render_rays(grid, request, RenderOptions(), "reference")
-    feature_ray_loss(seen.accumulation, seen.transmittance).backward()
-    gradient = grid.density.grad
-    assert gradient is not None
-    by_x = gradient.to_dense().view(LATTICE.shape).sum(dim=(1, 2))
-    x = torch.linspace(-1, 1, 21)
-    assert bool((by_x[(x > 0.15) & (x < 0.25)] < 0).all())
-    assert float(by_x[(x > -0.9) & (x < 0.0)].sum()) > float(by_x[(x > 0.15) & (x < 0.25)].sum())
-
-
 def test_a_ray_to_a_point_outside_the_box_asks_for_air_up_to_it_and_for_no_wall() -> None:
     rays = FeatureRays(np.zeros((1, 3)), np.zeros(1, np.int64), np.array([[4.0, 0.0, 0.0]]), np.full(1, 0.05))
     generator = torch.Generator().manual_seed(0)

@@ -156,25 +156,19 @@ def trained_grid(kind: str) -> tuple[VoxelGrid, dict[str, RowOptimizer]]:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("change", ["split", "prune"])
 def test_state_follows_split_and_pruned_rows(kind, change):
-    """As the values do: old corners keep theirs to the last bit."""
+    """As the values do, of which tests/field/test_refine.py tells what becomes."""
     grid, optimizers = trained_grid(kind)
-    voxels, old = grid.voxels, grid.row_parameters()
+    old = grid.row_parameters()
     states = {name: copy.deepcopy(dict(optimizers[name].state[p])) for name, p in old.items()}
-    if change == "split":
-        moved = refine(grid, 2)
-        same = np.ravel_multi_index(tuple((voxels.corner_index() * 2).T), grid.lattice.shape)
-        there, here = np.searchsorted(grid.voxels.corners, same), np.arange(voxels.num_rows)
-    else:
-        moved = prune(grid, np.arange(len(voxels)) % 3 == 0)
-        there, here = np.arange(grid.voxels.num_rows), np.searchsorted(voxels.corners, grid.voxels.corners)
+    moved = refine(grid, 2) if change == "split" else prune(grid, np.arange(len(grid.voxels)) % 3 == 0)
     for name, new in grid.row_parameters().items():
         optimizer = optimizers[name]
         optimizer.change_rows(old[name], new, moved)
         assert [p for group in optimizer.param_groups for p in group["params"]] == [new]
         assert list(optimizer.state) == [new] and new is not old[name]
         for key, values in optimizer.state[new].items():
-            assert len(values) == len(new) and values.shape[1:] == states[name][key].shape[1:]
-            assert torch.equal(values[there], states[name][key][here])
+            before = states[name][key]
+            assert torch.equal(values, moved(before.view(len(before), -1)).view(len(new), *before.shape[1:]))
         before = new.detach().clone()
         rows = torch.tensor([0, len(new) - 1])
         step(optimizer, new, torch.sparse_coo_tensor(rows[None], torch.ones(2, new.shape[1]), new.shape))

@@ -124,31 +124,6 @@ def layers(scene: Scene, density: dict[int, float]) -> None:
     scene.grid.density.data = values.reshape(-1, 1)
 
 
-def test_evidence_spends_every_ray_s_opacity_and_no_more(backend):
-    """In fog that lets much through, the weights of all voxels sum to what the rays lost."""
-    scene = slab(backend)
-    scene.grid.density.data = 0.05 + torch.rand(scene.grid.density.shape, generator=torch.Generator().manual_seed(0))
-    bundles = list(rays_along_minus_x())
-    opacity = sum(float((1 - scene.sample_rays(b.origins, b.directions).transmittance).sum()) for b in bundles)
-    assert 0.1 * 1600 < opacity < 0.9 * 1600
-    evidence = field_evidence(*scene, bundles)
-    assert evidence.rays == 1600
-    assert float(evidence.voxel_weight.sum()) == pytest.approx(opacity, rel=1e-5)
-    torch.testing.assert_close(evidence.voxel_weight.float(), total_weight(scene), rtol=1e-4, atol=1e-4)
-
-
-def test_half_depth_has_the_density_of_the_wall_that_each_ray_ends_on(backend):
-    """The wall is twice as dense where y > 0; the rays come row by row of y, so their order is known."""
-    scene = slab(backend)
-    y = torch.as_tensor(scene.grid.lattice.corner_positions()[..., 1]).reshape(-1, 1)
-    scene.grid.density.data *= torch.where(y > 0.01, 2.0, torch.where(y < -0.01, 1.0, 1.5))
-    found = field_evidence(*scene, rays_along_minus_x()).half_depth_density
-    # In the layer in front of the last solid corners half of the corners are solid.
-    centres = torch.tensor([250.0, 250.0, 312.5, 437.5, 500.0, 500.0])
-    origins = torch.cat([bundle.origins for bundle in rays_along_minus_x()])
-    torch.testing.assert_close(found, centres[((origins[:, 1] + 1) * 3).long()])
-
-
 @pytest.mark.parametrize(
     ("let_through", "wall", "found"), [(2 / 3, 500.0, 250.0), (1 / 3, 500.0, None), (0.1, -3e3 * math.log(0.1), None)]
 )
