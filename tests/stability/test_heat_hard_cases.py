@@ -7,7 +7,7 @@ import pytest
 from tests.support.heat_bodies import make_body
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
-from tests.support.obtuse_bodies import BLOCKS, CONCRETE, STEP_S, H, body, faults, spots
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, H, body, faults, spots
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import SDIRK2
@@ -47,7 +47,7 @@ def test_a_disconnected_piece(flux_w_m2) -> None:
         solve_steady(problem)
 
 
-@pytest.mark.parametrize("shape", [*BLOCKS, "sphere", "slab at 30 degrees"])
+@pytest.mark.parametrize("shape", [*BLOCKS, "sphere", "slab at 30 degrees", AT_THE_BOUNDS])
 @pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e6])
 @pytest.mark.parametrize(("strength", "sky"), [(0.0, False), (1e-9, False), (1e-9, True), (1e6, True)])
 def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength, sky) -> None:
@@ -58,7 +58,7 @@ def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength,
     assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high, shape) == []
 
 
-@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees"])
+@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
 @pytest.mark.parametrize("contrast", [1e-6, 1e6])
 def test_two_materials_in_turns(shape, contrast) -> None:
     """Neighbouring voxels conduct a million times better or worse."""
@@ -72,7 +72,7 @@ def test_two_materials_in_turns(shape, contrast) -> None:
     assert steady.temperature_c.min() >= -10.0 - 1e-2 and steady.temperature_c.max() <= 30.0 + 1e-2
 
 
-@pytest.mark.parametrize("shape", [*BLOCKS, "sphere"])
+@pytest.mark.parametrize("shape", [*BLOCKS, "sphere", AT_THE_BOUNDS])
 @pytest.mark.parametrize(
     ("start_c", "sky_c"), [(726.85, -270.15), (-270.15, 726.85), (-273.15, -270.15), (-273.15, 20.0)]
 )
@@ -90,7 +90,7 @@ def test_radiation_between_1000_k_and_3_k(shape, start_c, sky_c) -> None:
     np.testing.assert_allclose(solve_steady(problem).temperature_c, sky_c, atol=1e-4)
 
 
-@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees"])
+@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
 def test_adaptive_steps_through_a_shock(shape) -> None:
     effects = (Convection(("*",), 1e4, -50.0), Radiation(("*",), 0.9, -80.0))
     problem = HeatProblem(body(shape, 200.0), CONCRETE, effects=effects)

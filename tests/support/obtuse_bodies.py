@@ -1,14 +1,16 @@
 """Bodies from isosurface stuffing with patches and regions, whose angles between faces are obtuse here and there."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import Nodal, box_mesh
-from tests.support.stuffed_shapes import SHAPES, tet_mesh
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import OVERSHOOT_K
+from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
@@ -32,8 +34,14 @@ def dressed(mesh: TetMesh, temperature_c: Nodal = 20.0, regions: bool = False) -
     return mesh
 
 
+AT_THE_BOUNDS = "at the angle bounds"
+"""Name of a body whose angles are as bad as is promised."""
 MOST_OVERSHOOT = 0.5
-"""Share of the range by which single hot nodes may leave it beside obtuse angles."""
+"""Share of the range by which single hot nodes may leave it where angles are as bad as is promised."""
+NEAR_THE_BOUNDS_DEG = 0.1
+"""How far inside the promised range its worst angles are."""
+
+
 BLOCKS = ("regular", "carved", "shaken")
 """Names of blocks of cells: whole, with a third taken out, and with nodes moved so that angles are obtuse."""
 
@@ -41,7 +49,7 @@ BLOCKS = ("regular", "carved", "shaken")
 def body(
     shape: str = "slab at 30 degrees", temperature_c: Nodal = 20.0, regions: bool = False, size: int = 6
 ) -> TetMesh:
-    """One of the known shapes, 8 voxels wide, or one of `BLOCKS`, `size` voxels wide."""
+    """One of the known shapes, 8 voxels wide, `AT_THE_BOUNDS`, or one of `BLOCKS`, `size` voxels wide."""
     if shape in BLOCKS:
         keep = (lambda p: np.random.default_rng(5).random(p.shape[:3]) < 0.65) if shape == "carved" else None
         mesh = box_mesh(*[np.arange(size + 1) * H] * 3, keep=keep)
@@ -49,8 +57,33 @@ def body(
             moves = np.random.default_rng(6).uniform(-0.1 * H, 0.1 * H, mesh.points_m.shape)
             mesh = replace(mesh, points_m=mesh.points_m + moves)
     else:
-        mesh = tet_mesh(stuff(SHAPES[shape].level(8)), H)
+        mesh = at_the_angle_bounds() if shape == AT_THE_BOUNDS else tet_mesh(stuff(SHAPES[shape].level(8)), H)
     return dressed(mesh, temperature_c, regions)
+
+
+@lru_cache(maxsize=1)
+def at_the_angle_bounds() -> TetMesh:
+    """A sphere whose every node was moved in some direction until an angle beside it came to a bound.
+
+    Meshes of random levels come to 10.95 and 156 degrees by themselves.
+    """
+    mesh = tet_mesh(stuff(SHAPES["sphere"].level(6)), H)
+    points, rng = mesh.points_m.copy(), np.random.default_rng(4)
+    low, high = ANGLE_BOUNDS_DEG[0] + NEAR_THE_BOUNDS_DEG, ANGLE_BOUNDS_DEG[1] - NEAR_THE_BOUNDS_DEG
+    for node in rng.permutation(len(points)):
+        tets = mesh.tets[(mesh.tets == node).any(axis=1)]
+        direction = rng.normal(size=3)
+        direction *= H / np.linalg.norm(direction)
+        step = 0.1
+        # Onwards as long as all angles keep within the bounds, with ever shorter steps.
+        for _ in range(26):
+            before = points[node].copy()
+            points[node] = before + step * direction
+            least, most = dihedral_range_deg(points, tets)
+            corner = points[tets]
+            if least < low or most > high or np.linalg.det(corner[:, 1:] - corner[:, :1]).min() <= 0.0:
+                points[node], step = before, 0.5 * step
+    return replace(mesh, points_m=points)
 
 
 def spots(points: np.ndarray) -> np.ndarray:
