@@ -12,7 +12,7 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.results import heat_by_part, heat_results, wall_result
+from thermoxels_ns.heat.results import heat_results, wall_result
 from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
@@ -125,8 +125,7 @@ def test_hottest_and_coldest_spots_are_where_they_are() -> None:
     assert last["x0"].mean_c == pytest.approx(5.0) and last["x1"].coldest.temperature_c > 5.0
 
 
-def test_heat_by_part_agrees_with_the_solver_and_adds_up() -> None:
-    rng = np.random.default_rng(3)
+def test_heat_of_triangles_agrees_with_the_heat_of_effects() -> None:
     mesh = box_mesh(planes(0.0, 0.3, step=0.1), planes(0.0, 0.2, step=0.1), planes(0.0, 0.2, step=0.1))
     effects = (
         Convection(("x0",), 8.0, 20.0),
@@ -137,13 +136,10 @@ def test_heat_by_part_agrees_with_the_solver_and_adds_up() -> None:
     problem = HeatProblem(mesh, CONCRETE, effects=effects)
     solution = solve_steady(problem)
 
-    by_patch = heat_by_part(solution, mesh.boundary.patch, len(mesh.boundary.patch_names))
-    for number, name in enumerate(mesh.boundary.patch_names):
-        columns = [(heat, heat.group_names.index(name)) for heat in solution.effects if name in heat.group_names]
-        theirs_w = sum(float(heat.group_heat_w[0, column]) for heat, column in columns)
-        assert by_patch[number] == pytest.approx(theirs_w, rel=1e-9, abs=1e-9)
-    shuffled = heat_by_part(solution, rng.integers(0, 3, len(mesh.facets)), 3)
-    assert shuffled.sum() == pytest.approx(by_patch.sum(), abs=1e-9)
+    of_triangles = dict(zip(mesh.boundary.patch_names, np.bincount(mesh.boundary.patch, solution.facet_heat_w)))
+    of_effects = {one.patch: one.heat_w for one in heat_results(problem, solution).patches}
+    assert len(of_effects) == 6
+    assert {name: of_triangles[name] for name in of_effects} == pytest.approx(of_effects, rel=1e-9, abs=1e-9)
 
 
 def test_an_insulated_body_has_results() -> None:

@@ -32,15 +32,6 @@ class EffectHeat:
 
 
 @dataclass(frozen=True)
-class FacetHeat:
-    """Heat that one effect brings into the body through single boundary triangles, at one moment."""
-
-    effect: str  # Label of the effect, from `effect_labels`
-    facets: IntArray  # Numbers of the triangles, shape (k,)
-    heat_w: FloatArray  # Heat flow into the body through each triangle, shape (k,), [W]
-
-
-@dataclass(frozen=True)
 class ErrorSize:
     """Sizes of the errors of a solution."""
 
@@ -81,8 +72,8 @@ class HeatSolution:
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
     overshoot_k: float = 0.0
     """Most by which a temperature left the range of the start and of the surroundings, [K]; 0 if at most 0.01 K."""
-    last_facet_heat: tuple[FacetHeat, ...] = ()
-    """Heat flow of each effect through boundary triangles at the end, as if fixed nodes stored nothing."""
+    facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Heat flow into the body through each boundary triangle at the end, as if fixed nodes stored nothing, [W]."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +93,8 @@ class SteadySolution:
     unbalanced_w: float = 0.0
     """Heat that is unbalanced at all nodes, round-off included, [W]; no heat flow is more uncertain than this."""
     overshoot_k: float = 0.0  # Most by which a temperature is out of the surroundings' range, [K]; 0 if at most 0.01 K
-    last_facet_heat: tuple[FacetHeat, ...] = ()  # Heat flow of each effect through boundary triangles
+    facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Heat flow into the body through each boundary triangle, shape (f,), [W]."""
     error: ErrorSize | None = None  # Errors of the mesh as `tolerance.steady_error` estimates them; None: no estimate
 
 

@@ -62,7 +62,7 @@ def solve_steady(
         edge_temperature_c=temperature_c[num_mesh_nodes:],
         unbalanced_w=solution.unbalanced_w,
         overshoot_k=overshoot_k,
-        last_facet_heat=system.facet_heat(relative_k, 0.0),
+        facet_heat_w=system.facet_heat_w(relative_k, 0.0),
     )
 
 

@@ -25,7 +25,6 @@ from thermoxels_ns.fem.forms import (
 )
 from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.solution import FacetHeat
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -241,15 +240,16 @@ class HeatSystem:
         """Sum heat flows, in the order of `every_part_heat_w`, over each entry of `groups`, shape (g,), [W]."""
         return sums_by_number(self._group[: len(heat_w)], heat_w, len(self.groups))
 
-    def facet_heat(self, relative_k: Vector, time_s: float) -> tuple[FacetHeat, ...]:
-        """Return the heat flow of each effect but sources through its triangles, as if fixed nodes stored nothing."""
-        ends = np.cumsum([len(form.parts) for form in self._every_form])
-        parts = np.split(self.every_part_heat_w(relative_k, time_s), ends[:-1])
-        return tuple(
-            FacetHeat(form.effect, form.parts, heat_w)
-            for form, heat_w in zip(self._every_form, parts)
-            if form.kind != "source"
+    def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Return the heat flow through each boundary triangle, as if fixed nodes stored nothing, shape (f,), [W]."""
+        total_w, ends = (
+            np.zeros(len(self.problem.mesh.facets)),
+            np.cumsum([len(form.parts) for form in self._every_form]),
         )
+        for form, heat_w in zip(self._every_form, np.split(self.every_part_heat_w(relative_k, time_s), ends[:-1])):
+            if form.kind != "source":
+                total_w[form.parts] += heat_w
+        return total_w
 
     def is_still(self, relative_k: Vector, time_s: float) -> bool:
         """Return whether all temperatures, of body and surroundings, are equal up to `NOTHING` times absolute ones."""

@@ -199,7 +199,7 @@ class HeatBalance:
         # Summed without BLAS, whose sum depends on the number of its threads.
         spread = float(np.sum(mass * np.abs(states_k[0] - relative_content[0] / total_mass)))
         scale = max(spread + self._exchanged_j, _NOTHING * float(content[0]), _LEAST)
-        lengths, last_facet_heat = np.diff(times_s), system.facet_heat(states_k[-1], float(times_s[-1]))
+        lengths, facet_heat_w = np.diff(times_s), system.facet_heat_w(states_k[-1], float(times_s[-1]))
         overshoot_k, overshoot = out_of_range(self._beyond_k)
         repeated = f" {self.repeated} more were repeated with a shorter length." if self.repeated else ""
         states_k += system.reference_c
@@ -216,7 +216,7 @@ class HeatBalance:
             steps=self.steps,
             time_error_k=self._error_k,
             unbalanced_w=self._unbalanced_w,
-            last_facet_heat=last_facet_heat,
+            facet_heat_w=facet_heat_w,
             overshoot_k=overshoot_k,
         )
 

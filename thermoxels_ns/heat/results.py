@@ -204,7 +204,7 @@ def _regions(
 ) -> tuple[RegionResult, ...]:
     mesh, names, last_c = selection.mesh, selection.mesh.region_names, nodes.states_c[-1]
     behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
-    heat = heat_by_part(solution, behind, len(names))
+    heat = np.bincount(behind, solution.facet_heat_w, len(names))
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
     volume = signed_volumes(mesh.points_m, mesh.tets)
     total = np.bincount(mesh.region, volume, len(names))
@@ -322,8 +322,7 @@ def wall_result(
 
     def parts(numbers: IntArray, names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number, count = np.where(inner, numbers, len(names)), len(names) + 1
-        heat = heat_by_part(solution, number, count)
-        area = np.bincount(number, selection.facet_area_m2, count)
+        heat, area = (np.bincount(number, one, count) for one in (solution.facet_heat_w, selection.facet_area_m2))
         return tuple(
             WallPart(names[n], float(area[n]), float(heat[n]), float(heat[n] / area[n] / difference_k))
             for n in np.unique(number[inner]).tolist()
@@ -361,14 +360,3 @@ def matching_facets(selection: Selection, patterns: Sequence[str]) -> BoolArray:
     """Return True for each boundary triangle whose patch matches a name or pattern, shape (f,)."""
     matching = [name for pattern in patterns for name in matching_names(selection.patch_names, pattern)]
     return np.isin(selection.patch_names, matching)[selection.facet_patch]
-
-
-def heat_by_part(solution: Solution, part: IntArray, count: int) -> FloatArray:
-    """Return the heat flow into the body through each part of the surface at the end, shape (count,), [W].
-
-    `part`, shape (f,), is the number of the part, below `count`, of each boundary triangle of the mesh solved on.
-    """
-    total = np.zeros(count)
-    for heat in solution.last_facet_heat:
-        total += np.bincount(part[heat.facets], heat.heat_w, count)
-    return total
