@@ -29,44 +29,31 @@ def shown_states(times_s: FloatArray, wanted_s: Literal["all"] | tuple[float, ..
     return np.unique([np.abs(times_s - time_s).argmin() for time_s in near]).tolist()
 
 
-def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution, states: list[int]) -> list[Path]:
+def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: list[int]) -> None:
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
     `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are numbers of
-    kept times. Files left over from a longer earlier series are removed. Returns all paths, the .pvd first; raises
-    `OutputError` if writing fails.
+    kept times. An earlier series is removed first. Raises `OutputError` if writing fails.
     """
-    pvd = Path(pvd)
     writable_folder(pvd.parent)
+    remove_heat_series(pvd)
     folder = writable_folder(pvd.with_suffix(""))
-    steps = heat_series_paths(pvd, len(states))[1:]
-    for path, state in zip(steps, states):
-        write_vtu(path, replace(mesh, temperature_c=solution.temperature_c[state]))
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ElementTree.SubElement(root, "Collection")
-    for path, time_s in zip(steps, solution.times_s[states]):
+    for number, state in enumerate(states):
+        path, time_s = folder / f"step-{number:04d}.vtu", float(solution.times_s[state])
+        write_vtu(path, replace(mesh, temperature_c=solution.temperature_c[state]))
         name = path.relative_to(pvd.parent).as_posix()
-        ElementTree.SubElement(collection, "DataSet", timestep=repr(float(time_s)), part="0", file=name)
+        ElementTree.SubElement(collection, "DataSet", timestep=repr(time_s), part="0", file=name)
     ElementTree.indent(root)
     with replace_when_done(pvd) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
-    for path in set(folder.glob(STEP_PATTERN)) - set(steps):
-        remove_file(path)
-    return [pvd, *steps]
 
 
-def heat_series_paths(pvd: Path | str, num_states: int) -> list[Path]:
-    """Return the paths that `write_heat_series` writes for `num_states` kept times, the .pvd first."""
-    pvd = Path(pvd)
-    return [pvd, *(pvd.with_suffix("") / f"step-{number:04d}.vtu" for number in range(num_states))]
-
-
-def remove_heat_series(pvd: Path | str) -> None:
+def remove_heat_series(pvd: Path) -> None:
     """Remove a series that `write_heat_series` wrote, if there is one; raise `OutputError` if a file stays."""
-    pvd = Path(pvd)
-    remove_file(pvd)
     folder = pvd.with_suffix("")
-    for path in folder.glob(STEP_PATTERN):
+    for path in (pvd, *folder.glob(STEP_PATTERN)):
         remove_file(path)
     with suppress(OSError):  # it holds files of others, or there is none
         folder.rmdir()
