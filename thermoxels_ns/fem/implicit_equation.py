@@ -11,11 +11,11 @@ from scipy.optimize import root_scalar
 from scipy.sparse.linalg import LinearOperator, cg
 from threadpoolctl import ThreadpoolController
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
-from thermoxels_ns.fem.system import NOTHING, HeatSystem
+from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
@@ -149,8 +149,7 @@ class Residual:
     """Heat that an implicit equation leaves unbalanced at trial temperatures: inflow less the heat that is stored."""
 
     heat_w: Vector  # Unbalanced heat at each node, 0 at fixed nodes, shape (n,), [W]
-    piece_w: Vector
-    """Unbalanced heat of each connected piece, summed without conduction, (p,), [W]; 0 for pieces with fixed nodes."""
+    whole_w: float  # Unbalanced heat of the body, summed without conduction, [W]; 0 if there are fixed nodes
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
     round_off_w: float  # Round-off to expect in the sum over all free nodes, [W]
 
@@ -163,15 +162,10 @@ class Residual:
         """
         return float(np.sum(np.abs(self.heat_w)))
 
-    @cached_property
-    def floating_w(self) -> float:
-        """Sum over the pieces without fixed nodes of the size of the unbalanced heat, [W]."""
-        return float(np.sum(np.abs(self.piece_w)))
-
     @property
     def is_round_off(self) -> bool:
-        """True if the residual is nothing but round-off, both summed over all nodes and over the pieces."""
-        return max(self.unbalanced_w, self.floating_w) <= self.round_off_w
+        """True if the residual is nothing but round-off, both summed over all nodes and of the whole body."""
+        return max(self.unbalanced_w, abs(self.whole_w)) <= self.round_off_w
 
 
 @dataclass(frozen=True)
@@ -196,9 +190,9 @@ class ImplicitEquation:
     a diagonally implicit Runge-Kutta scheme has this form, `given` being the heat from earlier stages. The unknown is
     T - T_0, so that round-off is relative to the change. Without radiation one matrix serves all steps of one length.
 
-    Conduction moves heat within a connected piece and never out of it, so the heat that a piece without fixed nodes
-    stores and exchanges sets its mean change. In long steps of insulated pieces the matrix is all but singular, and the
-    linear solver would lose this mean; therefore the mean is solved for apart from the rest.
+    Conduction moves no heat out of a body, so the heat that a body without fixed nodes stores and exchanges sets its
+    mean change. In long steps of insulated bodies the matrix is all but singular, and the linear solver would lose this
+    mean; therefore the mean is corrected afterwards.
     """
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
@@ -215,8 +209,6 @@ class ImplicitEquation:
             self._row_sums_w_k += system.nodal_mass_j_k / step_s
         self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
         """The rows and columns of M / step + K + R that belong to free nodes, [W / K]."""
-        self._floating: BoolArray = ~system.pieces.touched(system.fixed.nodes)
-        """True for each piece without fixed nodes, shape (p,)."""
         self._solvers: dict[float, LinearSolver] = {}
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
@@ -238,13 +230,13 @@ class ImplicitEquation:
         tolerance = _NEWTON_TOLERANCE if nonlinear else self._relative_tolerance
         while count < most and np.isfinite(rest.unbalanced_w):
             now_k = start_k + change_k
-            direction, linear = self._correction(rest.heat_w, rest.piece_w, now_k, time_s, tolerance)
+            direction, linear = self._correction(rest.heat_w, rest.whole_w, now_k, time_s, tolerance)
             spent, count, status = spent + linear.iterations, count + 1, linear.status
             length = self._length(now_k, direction, rest.heat_w, time_s) if nonlinear else 1.0
             settled = not nonlinear or self._is_short(now_k, direction, _SETTLED)
             then_k = change_k + length * direction
             then = self._residual(start_k, then_k, time_s, given_w)
-            better = then.unbalanced_w < 0.5 * rest.unbalanced_w or then.floating_w < 0.5 * rest.floating_w
+            better = then.unbalanced_w < 0.5 * rest.unbalanced_w or abs(then.whole_w) < 0.5 * abs(rest.whole_w)
             if better or not settled or then.unbalanced_w < rest.unbalanced_w:
                 change_k, rest = then_k, then
             done = settled and (rest.unbalanced_w <= balanced * rest.flows_w or rest.is_round_off or not better)
@@ -257,7 +249,7 @@ class ImplicitEquation:
             # The sum over nodes misses heat that one effect brings to a node and another effect takes from this node.
             groups_w = self._system.by_group(self._system.part_heat_w(now_k, time_s))
             flows_w = max(flows_w, 0.5 * float(np.sum(np.abs(groups_w))))
-        balances = rest.is_round_off or uncertain_w <= MOST_UNBALANCED * flows_w or self._is_still(now_k, rest, time_s)
+        balances = rest.is_round_off or uncertain_w <= MOST_UNBALANCED * flows_w or self._system.is_still(now_k, time_s)
         if settled and not balances:
             status += (
                 f" {uncertain_w:.1e} W of {flows_w:.1e} W are not balanced: cells are too flat, or conductivities or "
@@ -268,18 +260,18 @@ class ImplicitEquation:
             now_k, change_k, uncertain_w, flows_w, spent, newton, converged=settled and balances, status=status
         )
 
-    def damped(self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float) -> Vector:
+    def damped(self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float) -> Vector:
         """Return an estimate e, (n,), [K]: (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w`.
 
-        `piece_w`, shape (p,), [W], sums `heat_w` over each piece without conduction and its round-off.
+        `whole_w`, [W], is the sum of `heat_w` without conduction and its round-off.
         """
-        return self._correction(heat_w, piece_w, relative_k, time_s, _ESTIMATE_TOLERANCE)[0]
+        return self._correction(heat_w, whole_w, relative_k, time_s, _ESTIMATE_TOLERANCE)[0]
 
     def _correction(
-        self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float, tolerance: float
+        self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float, tolerance: float
     ) -> tuple[Vector, LinearSolution]:
         """Solve for the change, (n,), [K], that takes up heat (as in `Residual`), radiation linear at `relative_k`."""
-        row_sums_w_k, pieces = self._row_sums_w_k, self._system.pieces
+        row_sums_w_k = self._row_sums_w_k
         if self._system.nonlinear:
             slope = self._system.radiation_slope(relative_k, time_s)
             row_sums_w_k = row_sums_w_k + slope @ np.ones(self._system.num_nodes)
@@ -288,21 +280,11 @@ class ImplicitEquation:
             if tolerance not in self._solvers:
                 self._solvers[tolerance] = LinearSolver(self._matrix, relative_tolerance=tolerance)
             solver = self._solvers[tolerance]
-        if not self._floating.any():
-            linear = solver.solve(self._at_free(heat_w))
-            return self._everywhere(linear.x), linear
-        held_w_k = np.where(self._floating, pieces.sums(row_sums_w_k), 1.0)
-
-        def share(left_w: Vector) -> Vector:
-            return pieces.at_nodes(np.where(self._floating, left_w / held_w_k, 0.0))
-
-        # Taking a multiple of the row sums from the heat shifts the solution by a constant in each piece.
-        rest_w = heat_w - share(pieces.sums(heat_w)) * row_sums_w_k
-        if np.sum(np.abs(rest_w)) <= _ROUND_OFF * np.sum(np.abs(heat_w)):
-            rest_w = np.zeros_like(rest_w)
-        linear = solver.solve(self._at_free(rest_w))
+        linear = solver.solve(self._at_free(heat_w))
         change_k = self._everywhere(linear.x)
-        return change_k + share(piece_w - pieces.sums(row_sums_w_k * change_k)), linear
+        if not len(self._system.fixed.nodes):
+            change_k += (whole_w - np.sum(row_sums_w_k * change_k)) / np.sum(row_sums_w_k)
+        return change_k, linear
 
     def _at_free(self, nodal: Vector) -> Vector:
         fixed = self._system.fixed
@@ -321,8 +303,7 @@ class ImplicitEquation:
     def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
         """Return the heat that is unbalanced at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
         system, now_k = self._system, start_k + change_k
-        pieces, conducted_w = system.pieces, system.conducted_heat(now_k)
-        parts_w = system.exchange_parts(now_k, time_s)
+        conducted_w, parts_w = system.conducted_heat(now_k), system.exchange_parts(now_k, time_s)
         if np.isfinite(self._step_s):
             parts_w.append(-system.nodal_mass_j_k * change_k / self._step_s)
         kept_w, moved_w, fixed = np.sum(parts_w, axis=0), np.sum(np.abs(parts_w), axis=0), system.fixed.nodes
@@ -331,17 +312,9 @@ class ImplicitEquation:
             kept_w, moved_w = kept_w + given_w, moved_w + np.abs(given_w)
         heat_w = kept_w - conducted_w
         heat_w[fixed] = 0.0
-        sizes_w = self._sizes_w_k * np.abs(pieces.without_means(now_k))
+        sizes_w = self._sizes_w_k * np.abs(now_k - now_k.mean())
         round_off_w = _ROUND_OFF * float(np.sum(self._at_free(sizes_w + moved_w)))
-        piece_w = np.where(self._floating, pieces.sums(kept_w), 0.0)
-        return Residual(heat_w, piece_w, 0.5 * flows_w, round_off_w)
-
-    def _is_still(self, now_k: Vector, rest: Residual, time_s: float) -> bool:
-        """Return whether next to no heat flows: all temperatures are equal, or all pieces level and hardly warmed."""
-        equal_k = NOTHING * (float(np.abs(now_k).max()) + abs(self._system.reference_c + ZERO_CELSIUS_K))
-        apart_k = float(np.abs(self._system.pieces.without_means(now_k)).max())
-        hardly = apart_k <= equal_k and rest.flows_w <= equal_k * float(np.sum(self._row_sums_w_k))
-        return hardly or self._system.is_still(now_k, time_s)
+        return Residual(heat_w, 0.0 if len(fixed) else float(np.sum(kept_w)), 0.5 * flows_w, round_off_w)
 
     def _is_short(self, now_k: Vector, direction: Vector, share: float) -> bool:
         """Return whether `direction` changes no absolute temperature by more than `share` of it."""

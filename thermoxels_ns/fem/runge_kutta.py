@@ -120,18 +120,16 @@ class RungeKutta:
         return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
-        """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
+        """Return the largest error, [K], from the scheme of the next order; the sum leaves conduction out."""
         system, scheme = self.system, self._scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.weights[-1]])]
-        exchanged_w = system.exchanged_heat(start_k, time_s)
-        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), more[0] * exchanged_w)
-        difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
-        end_s = time_s + scheme.nodes[-1] * step_s
+        exchanged_w = more[0] * system.exchanged_heat(start_k, time_s)
+        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), exchanged_w)
+        difference_w, end_s = exchange_w - more[0] * system.conducted_heat(start_k), time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
-        error = equation.damped(difference_w, system.pieces.sums(exchange_w), start_k, end_s)
-        return float(np.max(np.abs(error)))
+        return float(np.max(np.abs(equation.damped(difference_w, float(np.sum(exchange_w)), start_k, end_s))))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
         time_s = time_s if self.system.matrix_in_time else 0.0

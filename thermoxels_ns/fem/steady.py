@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
@@ -92,15 +93,15 @@ def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
 
 def _check_held(system: HeatSystem) -> None:
     """Raise `HeatError` if a connected piece has nothing that sets its temperature in a steady state."""
-    pieces, forms = system.pieces, system.surface_forms
-    held = np.concatenate([system.fixed.nodes, *(form.exchanging_nodes(0.0) for form in forms)])
-    loose = np.flatnonzero(~pieces.touched(held))
+    count, piece = connected_components(system.stiffness, directed=False)
+    held = np.concatenate([system.fixed.nodes, *(form.exchanging_nodes(0.0) for form in system.surface_forms)])
+    loose = np.setdiff1d(np.arange(count), piece[held])
     if len(loose):
-        sizes = np.bincount(pieces.number)
+        sizes = np.bincount(piece)
         largest = loose[np.argmax(sizes[loose])]
-        points = system.space.points_m[pieces.number == largest]
+        points = system.space.points_m[piece == largest]
         low, high = (", ".join(f"{part:.4g}" for part in end) for end in (points.min(axis=0), points.max(axis=0)))
-        got = f"none on {len(loose)} of {pieces.count} pieces; the largest has {sizes[largest]} nodes in the box from "
+        got = f"none on {len(loose)} of {count} pieces; the largest has {sizes[largest]} nodes in the box from "
         got += f"({low}) to ({high}) m"
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
         expected = "convection, radiation, ground contact or a fixed temperature on every connected piece of a body"

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import (
@@ -36,44 +34,6 @@ NOTHING = 1e-9
 """Differences of temperature below this share of the absolute temperature let no heat flow to speak of."""
 _LEAST = float(np.finfo(np.float64).tiny)
 _KEPT_RANGES = 64  # Number of times for which the range of the surroundings is kept
-
-
-class Pieces:
-    """The p connected pieces of a body: the piece of each of the n nodes, and sums over the pieces.
-
-    >>> pieces = Pieces(sparse.csr_matrix([[2.0, -2.0, 0.0], [-2.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
-    >>> pieces.count, pieces.sums(np.array([1.0, 2.0, 4.0])).tolist()
-    (2, [3.0, 4.0])
-    """
-
-    def __init__(self, stiffness: sparse.csr_matrix) -> None:
-        """Find the pieces: the sets of nodes between which the symmetric matrix has no entry."""
-        count, number = connected_components(stiffness, directed=False)
-        self.count = int(count)
-        """Number of pieces, p."""
-        self.number: npt.NDArray[np.int32] = number
-        """Number of each node's piece, shape (n,)."""
-        self._sizes = np.bincount(number, minlength=self.count)
-
-    def sums(self, nodal: Vector) -> Vector:
-        """Return the sum of nodal values over each piece, shape (p,)."""
-        if self.count == 1:
-            return np.array([np.sum(nodal)])
-        return np.bincount(self.number, weights=nodal, minlength=self.count).astype(np.float64, copy=False)
-
-    def at_nodes(self, values: Vector) -> Vector:
-        """Return at each node the value of the node's piece, shape (n,); with one piece `values` itself, shape (1,)."""
-        return values[self.number] if self.count > 1 else values
-
-    def without_means(self, nodal: Vector) -> Vector:
-        """Return nodal values less the mean of their piece, shape (n,)."""
-        return nodal - self.at_nodes(self.sums(nodal) / self._sizes)
-
-    def touched(self, nodes: IntArray) -> BoolArray:
-        """Return True for each piece that contains any of the nodes, shape (p,)."""
-        marks = np.zeros(self.count, dtype=bool)
-        marks[self.number[nodes]] = True
-        return marks
 
 
 class HeatSystem:
@@ -105,8 +65,6 @@ class HeatSystem:
         """Nodes whose temperature is given."""
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
-        self.pieces: Pieces = Pieces(self.stiffness)
-        """Connected pieces of the body, between which no heat is conducted."""
         self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)
@@ -211,9 +169,9 @@ class HeatSystem:
     def conducted_heat(self, relative_k: Vector) -> Vector:
         """Return K T, the heat that flows from each node to its neighbours, shape (n,), [W].
 
-        The mean of each piece is subtracted from T first: it conducts nothing, but would leave round-off.
+        The mean is subtracted from T first: it conducts nothing, but would leave round-off.
         """
-        return self.stiffness @ self.pieces.without_means(relative_k)
+        return self.stiffness @ (relative_k - relative_k.mean())
 
     def net_heat(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat into each node from outside and from its neighbours, shape (n,), [W].
