@@ -5,8 +5,7 @@ import pytest
 from skfem import Basis, ElementTetP1, ElementTetP2, MeshTet
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import Material

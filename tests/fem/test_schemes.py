@@ -8,8 +8,7 @@ from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import solve_heat

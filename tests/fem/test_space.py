@@ -5,8 +5,7 @@ import pytest
 
 from tests.support.heat_bodies import STEEL
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady

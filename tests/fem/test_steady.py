@@ -9,8 +9,7 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation, steady
 from thermoxels_ns.fem.implicit_equation import LinearSolver
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying
 from thermoxels_ns.fem.solution import EffectHeat
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem

@@ -6,8 +6,7 @@ import pytest
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import ConvectionForm, effect_forms
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.time_loop import solve_heat

@@ -6,9 +6,8 @@ import pytest
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.fem.quantities import Places, Varying, values_at
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.problem import TimeSteps, Varying, values_at
+from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import material, material_table

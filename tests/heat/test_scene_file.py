@@ -10,9 +10,8 @@ from tests.support.epw_file import write_epw
 from tests.support.scene_bodies import room
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
-from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.quantities import Places, Varying, values_at
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps, Varying, values_at
+from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,

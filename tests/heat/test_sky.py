@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.quantities import Places, Varying, values_at
+from thermoxels_ns.fem.problem import Varying, values_at
+from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, AbsorbedSolar, Radiation
 from thermoxels_ns.heat.scene_fields import Sun
 from thermoxels_ns.heat.sky import (

@@ -9,8 +9,7 @@ import pytest
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from tests.support.obtuse_bodies import body
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying, tabulated
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying, tabulated
 from thermoxels_ns.fem.solution import SteadySolution, mean_flows_w
 from thermoxels_ns.fem.tolerance import LEAVE_OUT_BELOW
 from thermoxels_ns.heat import solving as heat_solving

@@ -13,8 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.tolerance import Goals, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature

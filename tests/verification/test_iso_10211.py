@@ -13,8 +13,7 @@ import pytest
 
 from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
 from tests.support.heat_meshes import box_mesh, graded, planes
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import Convection, FixedTemperature

@@ -25,7 +25,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import Varying
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat

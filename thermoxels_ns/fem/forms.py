@@ -14,8 +14,7 @@ from scipy import sparse
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.problem import Effect, HeatProblem, effect_labels
-from thermoxels_ns.fem.quantities import in_time, values_at
+from thermoxels_ns.fem.problem import Effect, HeatProblem, effect_labels, in_time, values_at
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray

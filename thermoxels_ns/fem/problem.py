@@ -1,15 +1,16 @@
-"""A heat problem: body, materials, start and effects; and the time steps in which a solver follows a body."""
+"""A heat problem: body, materials, start, effects and their quantities; and the time steps in which it is followed."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
@@ -18,8 +19,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import raising, record
 from thermoxels_ns.fem.linear_tets import refuse_flat_tets
-from thermoxels_ns.fem.quantities import Quantity, Varying
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_CONTRAST = 1e9
@@ -77,6 +77,60 @@ class AdaptiveSteps:
     def times_s(self) -> FloatArray:
         """Time 0, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
+
+
+@dataclass(frozen=True)
+class Varying:
+    """A quantity that differs from place to place or changes with time.
+
+    >>> sunrise = Varying(lambda places, time_s: 100.0 * min(time_s / 3600.0, 1.0))
+    >>> sunrise.function(Places(np.zeros((2, 3)), np.zeros((2, 3))), 1800.0)
+    50.0
+    """
+
+    function: Callable[[Places, float], npt.ArrayLike]
+    """Function of the places and of the time in seconds since the start; it returns one number per place, shape (k,),
+    or one number for all places."""
+    in_time: bool = True  # True if the numbers change with time; False: they are always those at the time 0
+    resolution_s: float = math.inf
+    """Longest time between two evaluations that misses no change, above 0, [s]; no adaptive step is longer."""
+
+
+def tabulated(times_s: FloatArray, values: FloatArray) -> Varying:
+    """Return a quantity that is interpolated linearly between the entries of a table of times and values.
+
+    Before the first entry it has the first value, after the last entry the last value. Adaptive steps are no longer
+    than the shortest time between two entries, so that no entry is stepped over.
+
+    Args:
+        times_s: Times, ascending, at least two, shape (k,), [s].
+        values: Values of the quantity at these times, shape (k,).
+
+    >>> tabulated(np.array([0.0, 3600.0, 7200.0]), np.array([10.0, 20.0, 10.0])).resolution_s
+    3600.0
+    """
+    return Varying(partial(_interpolated, times_s, values), resolution_s=float(np.min(np.diff(times_s))))
+
+
+def _interpolated(times_s: FloatArray, values: FloatArray, _: Places, time_s: float) -> float:
+    return float(np.interp(time_s, times_s, values))
+
+
+Quantity: TypeAlias = float | Varying  # One number for all places and times, or a function
+
+
+def in_time(quantity: Quantity) -> bool:
+    """Return whether a quantity changes with time."""
+    return isinstance(quantity, Varying) and quantity.in_time
+
+
+def values_at(quantity: Quantity, places: Places, time_s: float) -> FloatArray:
+    """Return the values of a quantity at k places and a time, shape (k,)."""
+    if isinstance(quantity, Varying):
+        found = quantity.function(places, time_s if quantity.in_time else 0.0)
+    else:
+        found = quantity
+    return np.broadcast_to(np.asarray(found, dtype=np.float64), (len(places),)).copy()
 
 
 class Effect:

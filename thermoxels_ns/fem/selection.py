@@ -1,8 +1,9 @@
-"""Where effects act: named patches of the boundary and regions of the body."""
+"""Where effects act: named patches of the boundary, regions of the body, and places on and in them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
 
@@ -10,8 +11,19 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError, ThermoxelsError
-from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
+
+
+@dataclass(frozen=True)
+class Places:
+    """The k places where a quantity is evaluated: centroids of boundary triangles, points in tetrahedra, or nodes."""
+
+    points_m: FloatArray  # Positions, shape (k, 3), [m]
+    normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 in tetrahedra and at nodes
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
+
+    def __len__(self) -> int:
+        return len(self.points_m)
 
 
 class Selection:

@@ -15,8 +15,7 @@ from skfem.refdom import RefTet, RefTri
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_tets import FACET_EDGES, TET_EDGES, MeshEdges, mesh_edges, stiffness_matrix
-from thermoxels_ns.fem.quantities import Places
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 Vector = FloatArray

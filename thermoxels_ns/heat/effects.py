@@ -9,8 +9,7 @@ from pydantic import Field
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import record
-from thermoxels_ns.fem.problem import Effect
-from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.fem.problem import Effect, Quantity, Varying
 
 HOTTEST_C = 10_000.0
 """Highest temperature that is accepted, [degrees Celsius]; above it a unit is wrong: the sun's surface has 5500."""

@@ -16,8 +16,7 @@ from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.core.units import kelvin_to_celsius
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.tolerance import ToleratedSolution

@@ -24,9 +24,8 @@ from pydantic import Discriminator, Field, Tag
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Places, Quantity, Varying
-from thermoxels_ns.fem.selection import Selection, chosen_names, matching_names
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Quantity, TimeSteps, Varying
+from thermoxels_ns.fem.selection import Places, Selection, chosen_names, matching_names
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Celsius,

@@ -17,7 +17,8 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.core.yaml_records import raising, record
-from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
+from thermoxels_ns.fem.problem import Quantity, Varying, tabulated
+from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.heat.effects import (
     HOTTEST_C,
     STEFAN_BOLTZMANN_W_M2K4,

@@ -13,7 +13,8 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
-from thermoxels_ns.fem.quantities import Places, Quantity, Varying
+from thermoxels_ns.fem.problem import Quantity, Varying
+from thermoxels_ns.fem.selection import Places
 
 Vector = tuple[float, float, float]
 

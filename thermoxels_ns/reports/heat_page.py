@@ -7,8 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from thermoxels_ns.fem.problem import effect_labels
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import Varying, effect_labels
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect
 from thermoxels_ns.heat.materials import materials_by_region
