@@ -7,7 +7,7 @@ from threadpoolctl import threadpool_limits
 from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem import implicit_equation, steady
+from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying
 from thermoxels_ns.fem.solution import EffectHeat
@@ -78,7 +78,7 @@ FLOWING = pytest.mark.parametrize("effects", [GIVEN, HARDLY, AIR, SKY], ids=["gi
 @FLOWING
 @pytest.mark.parametrize("thickness_m", [1e-3, 1e-4, 1e-5, 1e-6])
 def test_a_steady_balance_that_is_wrong_is_seen(monkeypatch, effects, thickness_m) -> None:
-    problem, right = sheet(thickness_m, *effects), steady.heat_of_groups_w
+    problem, right = sheet(thickness_m, *effects), HeatSystem.by_group
     solution = solve_steady(problem)
     flows_w = np.array([heat.heat_w[0] for heat in solution.effects])
     # The share of the heat that flows is said as it is: in and out are counted.
@@ -89,7 +89,7 @@ def test_a_steady_balance_that_is_wrong_is_seen(monkeypatch, effects, thickness_
         heat_w[0] += WRONG * np.abs(heat_w).max() * (1.0 if heat_w.sum() >= 0.0 else -1.0)
         return heat_w
 
-    monkeypatch.setattr(steady, "heat_of_groups_w", wrong)
+    monkeypatch.setattr(HeatSystem, "by_group", wrong)
     assert solve_steady(problem).energy_residual > 0.3 * WRONG
 
 

@@ -257,11 +257,15 @@ class HeatProblem:
         """Heat capacity per volume of each tetrahedron, shape (t,), [J / (m3 K)]."""
         return self._of_tets("heat_capacity_j_m3k")
 
+    @property
+    def materials(self) -> dict[str, Material]:
+        """The material of each region that has tetrahedra, by its name."""
+        one, used = self.material, [self.mesh.region_names[number] for number in np.unique(self.mesh.region)]
+        return {name: one if isinstance(one, Material) else one[name] for name in used}
+
     def _of_tets(self, name: str) -> FloatArray:
-        if isinstance(self.material, Material):
-            return np.full(len(self.mesh.tets), float(getattr(self.material, name)))
-        known, names = self.material, self.mesh.region_names
-        by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
+        made_of = self.materials
+        by_region = [float(getattr(made_of[one], name)) if one in made_of else np.nan for one in self.mesh.region_names]
         return np.array(by_region)[self.mesh.region]
 
     def _check_materials(self) -> None:
@@ -273,7 +277,7 @@ class HeatProblem:
             expected = f"a material for each of the regions {', '.join(sorted(used))}"
             remedy = "Add them, or '*' for all others to a scene."
             raise HeatError("materials", expected=expected, got=f"none for {', '.join(missing)}", remedy=remedy)
-        conductivities = {name: self.material[name].conductivity_w_mk for name in used}
+        conductivities = {name: made_of.conductivity_w_mk for name, made_of in self.materials.items()}
         least, most = (choose(conductivities, key=conductivities.__getitem__) for choose in (min, max))
         if conductivities[most] > MOST_CONTRAST * conductivities[least]:
             got = f"{conductivities[least]:g} W/(m K) in {least} and {conductivities[most]:g} in {most}"

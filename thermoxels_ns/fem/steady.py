@@ -48,7 +48,7 @@ def solve_steady(
         raise HeatError(f"No steady state was found. {solution.status} Check the mesh's quality and the effects.")
     refuse_too_cold(system, solution.relative_k)
     relative_k, num_mesh_nodes = solution.relative_k, len(problem.mesh.points_m)
-    group_heat = heat_of_groups_w(system, relative_k)
+    group_heat = system.by_group(system.every_part_heat_w(relative_k, 0.0))
     flows_w = 0.0 if system.is_still(relative_k, 0.0) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
     temperature_c = relative_k + system.reference_c
     low, high = system.surroundings_k(0.0)  # a steady state does not depend on its start
@@ -73,11 +73,6 @@ def out_of_range(beyond_k: float) -> tuple[float, str]:
         return 0.0, ""
     said = f" A temperature left its range by up to {beyond_k:.2g} K: the mesh or the steps do not resolve a jump."
     return beyond_k, said
-
-
-def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
-    """Return the heat flow into the body of each of the system's `groups` in a steady state, shape (g,), [W]."""
-    return system.by_group(system.every_part_heat_w(relative_k, 0.0))
 
 
 def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, read_yaml, record
-from thermoxels_ns.fem.problem import HeatProblem, Material, Text
+from thermoxels_ns.fem.problem import Material, Text
 
 
 @record(HeatError)
@@ -49,11 +46,3 @@ def material(name: str) -> Material:
         raise HeatError("material", expected=expected, got=repr(name), remedy=remedy)
     row = rows[name]
     return Material(name, row.conductivity_w_mk, row.density_kg_m3, row.specific_heat_j_kgk)
-
-
-def materials_by_region(problem: HeatProblem) -> dict[str, Material]:
-    """Return materials by the names of the regions of a problem; regions without a tetrahedron are left out."""
-    names = [problem.mesh.region_names[number] for number in np.unique(problem.mesh.region)]
-    return {
-        name: problem.material[name] if isinstance(problem.material, Mapping) else problem.material for name in names
-    }

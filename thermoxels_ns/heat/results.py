@@ -18,7 +18,6 @@ from thermoxels_ns.fem.solution import (
     solution_nodes,
 )
 from thermoxels_ns.heat.effects import Convection, InternalHeat
-from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
@@ -203,7 +202,7 @@ def _regions(
     problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes
 ) -> tuple[RegionResult, ...]:
     mesh, names, last_c = selection.mesh, selection.mesh.region_names, nodes.states_c[-1]
-    behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
+    behind, made_of = region_behind_facets(problem.mesh), problem.materials
     heat = np.bincount(behind, solution.facet_heat_w, len(names))
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
     volume = signed_volumes(mesh.points_m, mesh.tets)

@@ -10,7 +10,6 @@ import numpy as np
 from thermoxels_ns.fem.problem import Varying, effect_labels
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect
-from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.heat.scene import unit_of
 from thermoxels_ns.reports.charts import plot_over_time
@@ -41,7 +40,6 @@ def heat_page(
         ],
         mesh_name=mesh_name,
         mesh_error=mesh_error_in_words(solution),
-        materials=materials_by_region(run.problem),
         effects=[(label, _values(effect)) for label, effect in zip(effect_labels(run.problem), run.problem.effects)],
         linear_steps=int(np.sum(solution.iterations)),
         newton_steps=int(np.sum(solution.newton_iterations)),
