@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import PARAMETERS
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.data.colmap_model import PARAMETERS, lens_entries
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
@@ -32,6 +34,7 @@ _ANCHORS = 40
 that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
+_FATAL_ONLY = 3
 
 
 def find_poses(
@@ -48,9 +51,14 @@ def find_poses(
     stated focal length. Results of an interrupted run in `folder` are reused. Only the largest set of photographs that
     fit is kept.
 
+    On some errors, such as a thread that cannot write, COLMAP says why and aborts; the next run goes on from there.
+
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
+        ThermoxelsError: COLMAP raised an error.
     """
+    import pycolmap
+
     if len(photographs) < MIN_FRAMES:
         raise _too_few(len(photographs), "photographs of one size")
     frame_of_image, small = _reduced(photographs, folder / _IMAGES, size, settings.image_size)
@@ -59,8 +67,17 @@ def find_poses(
         start = {"cx": small[0] / 2.0, "cy": small[1] / 2.0}
         start |= dict.fromkeys(("f", "fl_x", "fl_y"), focal_px * small[0] / size[0])
         params = ",".join(str(start.get(name, 0.0)) for name in PARAMETERS[settings.lens])
-    run_in_process(_find_and_match, (folder, list(frame_of_image), params, settings), say)
-    model = run_in_process(_map, (folder, frame_of_image, size, settings.seed), say)
+    log_of_colmap: Any = pycolmap.logging
+    log_of_colmap.minloglevel = _FATAL_ONLY
+    try:
+        with threadpool_limits(1, "blas"):  # pycolmap has its own BLAS, whose sums depend on its number of threads
+            _find_and_match(folder, list(frame_of_image), params, settings, say)
+            model = _map(folder, frame_of_image, size, settings.seed, say)
+    except OSError:
+        raise
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError and others
+        remedy = "Check free space; if that does not help, begin anew with --from-stage poses."
+        raise ThermoxelsError("COLMAP", expected="to finish its work", got=problem, remedy=remedy) from problem
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
     return model
@@ -128,6 +145,42 @@ def _map(
         return None
     largest = max(groups.values(), key=lambda group: (group.num_reg_images(), len(group.points3D)))
     return model_of_colmap(largest, frame_of_image, size)
+
+
+def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int]) -> SfmModel:
+    """Convert a pycolmap.Reconstruction with one camera into an `SfmModel`.
+
+    The model has the posed images that are keys of `frame_of_image`, in that order. `size` is the original photographs'
+    width and height, from which the images may have been reduced.
+    """
+    by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
+    posed = [by_name[name] for name in frame_of_image if name in by_name]
+    camera = reconstruction.cameras[posed[0].camera_id]
+    values: dict[str, Any] = lens_entries(camera.model.name, camera.params)
+    found = Camera(int(camera.width), int(camera.height), **values)
+    factor = np.array([size[0] / found.width, size[1] / found.height])
+    ids = sorted(reconstruction.points3D)
+    points = [reconstruction.points3D[i] for i in ids]
+    number = {i: n for n, i in enumerate(ids)}
+    poses, frames, seen, pixels = [], [], [], []
+    for index, image in enumerate(posed):
+        poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
+        # A scene point may have two features in one photograph; only the first feature is kept.
+        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
+        order = sorted(own)
+        frames += [index] * len(order)
+        seen += order
+        pixels += [own[point] for point in order]
+    return SfmModel(
+        tuple(frame_of_image[image.name] for image in posed),
+        found.resized(*size),
+        np.stack(poses),
+        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
+        np.array(frames, dtype=np.int64),
+        np.array(seen, dtype=np.int64),
+        np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
+    )
 
 
 def image_pairs(count: int) -> IntArray:
