@@ -13,9 +13,9 @@ from pydantic import TypeAdapter
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.stage_cache import load_json
+from thermoxels_ns.capture.stage_cache import EXPECTED, REMEDY
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.core.json_values import read_json, write_json
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions, conditions_text
 from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
@@ -56,7 +56,7 @@ class CaptureFrames:
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
         """Read the list that `read_frames` wrote to `folder`; `root` is the capture folder, and both may have moved."""
-        found = TypeAdapter(CaptureFrames).validate_python(load_json(folder / _LIST))
+        found = TypeAdapter(CaptureFrames).validate_python(read_json(folder / _LIST, EXPECTED, REMEDY))
         frames = []
         for frame in found.frames:
             taken_out = frame.name == frame.thermal_source

@@ -25,8 +25,6 @@ from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 JSON_NAME = "transforms.json"
 TRACKS_NAME = "sparse_tracks.npz"
 _FOLDERS = ("images", "thermal")
-SCENE_CONTENT = (JSON_NAME, TRACKS_NAME, *_FOLDERS)
-"""Names of a scene's files and folders in the output folder."""
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 EVAL_INTERVAL = 8
 

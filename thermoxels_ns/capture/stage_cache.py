@@ -1,4 +1,4 @@
-"""Keeps the results of stages, arrays in .npz files and the rest in json, and runs again only what has changed."""
+"""Keeps the results of the stages that take minutes, and runs again only what has changed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.version import __version__
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
@@ -24,7 +23,7 @@ CACHE_FOLDER = ".capture"
 _FORMAT = 4  # number of the results' file format; a higher number makes all earlier results invalid
 _KEY_FILE, _DONE_FILE = "key.txt", "done"
 _Record = TypeVar("_Record")
-_EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
+EXPECTED, REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage temperatures."
 
 
 @dataclass
@@ -41,15 +40,12 @@ class StageCache:
     say: Callable[[str], None] = lambda _: None  # told one line per stage
     _previous: str = ""
 
-    def run(
-        self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None], writes: Sequence[Path] = ()
-    ) -> Path:
+    def run(self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None]) -> Path:
         """Run a stage, or find its earlier result still valid; return the folder with the result.
 
         Call this once per stage, in the order of `STAGES`. `depends_on` names everything that the result depends on
         besides earlier stages, as values for json. `work` writes the result into the folder passed to it, which may
-        still hold files of an interrupted run with the same key. `writes` are files and folders that the stage writes
-        elsewhere; the stage runs again if one of them is missing.
+        still hold files of an interrupted run with the same key.
 
         Raises:
             OutputError: The result cannot be written.
@@ -59,10 +55,9 @@ class StageCache:
         self._previous = key
         folder = self.folder / CACHE_FOLDER / name
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
-        title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
         stale = forced or _read(folder / _KEY_FILE) != key
-        if not stale and (folder / _DONE_FILE).is_file() and all(path.exists() for path in writes):
-            self.say(f"{title}: as before")
+        if not stale and (folder / _DONE_FILE).is_file():
+            self.say(f"{name}: as before")
             return folder
         remove_file(folder / _DONE_FILE)
         if stale:
@@ -73,7 +68,6 @@ class StageCache:
         writable_folder(folder)
         with replace_when_done(folder / _KEY_FILE) as temporary:
             temporary.write_text(key, encoding="utf-8")
-        self.say(title)
         work(folder)
         (folder / _DONE_FILE).touch()
         return folder
@@ -128,13 +122,8 @@ def load(path: Path, kind: type[_Record]) -> _Record:
             arrays = {name: opened[name] for name in opened.files}
     except (OSError, ValueError, KeyError) as problem:
         got = str(problem) or type(problem).__name__
-        raise ThermoxelsError(str(path), expected=_EXPECTED, got=got, remedy=_REMEDY) from problem
+        raise ThermoxelsError(str(path), expected=EXPECTED, got=got, remedy=REMEDY) from problem
     return kind(**{name: _value(arrays[name], hint) for name, hint in get_type_hints(kind).items()})
-
-
-def load_json(path: Path) -> Any:
-    """Read a json file that a stage wrote; raise `ThermoxelsError` if the file is missing or damaged."""
-    return read_json(path, _EXPECTED, _REMEDY)
 
 
 def _value(array: np.ndarray, hint: Any) -> Any:
