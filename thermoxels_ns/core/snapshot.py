@@ -78,14 +78,10 @@ class RayEvidence:
     half_depth_density: Float32Array
     """For each ray whose opacity exceeds 1/2, the highest density at the centres of the voxels that the ray crosses
     within half a voxel of the point at which half of its weight is spent, shape (rays,), [1 / world unit]."""
-    ends: Float32Array | None = None
+    ends: Float32Array
     """Where these rays end: the points at which half of their weight is spent, in corner indices of the lattice, shape
-    (rays, 3). None: not known."""
-    directions: Float32Array | None = None  # Unit vectors of these rays, shape (rays, 3); None only if `ends` is
-
-    def __post_init__(self) -> None:
-        if (self.ends is None) != (self.directions is None):
-            raise MeshError("ray evidence", expected="ends and directions, or neither", got="one", remedy=_FIELD)
+    (rays, 3)."""
+    directions: Float32Array  # Unit vectors of these rays, shape (rays, 3)
 
 
 @dataclass(frozen=True)
