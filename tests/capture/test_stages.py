@@ -13,8 +13,9 @@ from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses,
 from thermoxels_ns import cli
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
-from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
+from thermoxels_ns.capture.scene_writer import write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
@@ -22,7 +23,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.scene_scale import SceneScale, scale_from_scene_file, up_from_scene_file
-from thermoxels_ns.data.tracks import read_tracks
+from thermoxels_ns.data.tracks import find_tracks
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
 
@@ -223,9 +224,11 @@ def test_numbers_come_back_as_they_went_in(written):
 def test_tracks_say_which_training_photograph_sees_which_point(written):
     scene, folder = written
     outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
-    tracks = read_tracks(folder / TRACKS_NAME)
-    assert np.array_equal(tracks.points, scene.model.points)
-    assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
+    tracks = find_tracks(read_scene_file(folder))
+    assert tracks is not None
+    np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
+    np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
+    assert len(tracks.sighting_point) == len(scene.model.sighting_point)
     seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
     train = [number for number, name in enumerate(tracks.frames) if "train" in name]
     assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
@@ -241,7 +244,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, m
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_tracks", stop)
+    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_json", stop)
     with pytest.raises(KeyboardInterrupt):
         write_scene_folder(scene, folder)
     assert (folder / "transforms.json").read_bytes() == before

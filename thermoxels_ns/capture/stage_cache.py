@@ -6,12 +6,13 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, get_args
 
 import numpy as np
 
+from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
@@ -20,9 +21,8 @@ from thermoxels_ns.core.version import __version__
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-_FORMAT = 4  # number of the results' file format; a higher number makes all earlier results invalid
+_FORMAT = 5  # number of the results' file format; a higher number makes all earlier results invalid
 _KEY_FILE, _DONE_FILE = "key.txt", "done"
-_Record = TypeVar("_Record")
 EXPECTED, REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage temperatures."
 
 
@@ -106,31 +106,18 @@ def _read(file: Path) -> str | None:
         return None
 
 
-def save(path: Path, record: Any) -> None:
-    """Write a dataclass (fields: arrays, numbers, texts, tuples, cameras) as .npz, atomically."""
-    values = {each.name: getattr(record, each.name) for each in fields(record)}
-    for name, value in values.items():
-        if isinstance(value, Camera):
-            values[name] = astuple(value)
-    write_npz(path, {name: np.asarray(value) for name, value in values.items()})
+def save_rig(path: Path, rig: RigEstimate) -> None:
+    """Write a rig as .npz, atomically."""
+    write_npz(path, {**vars(rig), "thermal_camera": np.array(astuple(rig.thermal_camera))})
 
 
-def load(path: Path, kind: type[_Record]) -> _Record:
-    """Read a dataclass of type `kind` that `save` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
+def load_rig(path: Path) -> RigEstimate:
+    """Read a rig that `save_rig` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as opened:
-            arrays = {name: opened[name] for name in opened.files}
+            values = {name: opened[name].tolist() if opened[name].ndim < 2 else opened[name] for name in opened.files}
     except (OSError, ValueError, KeyError) as problem:
         got = str(problem) or type(problem).__name__
         raise ThermoxelsError(str(path), expected=EXPECTED, got=got, remedy=REMEDY) from problem
-    return kind(**{name: _value(arrays[name], hint) for name, hint in get_type_hints(kind).items()})
-
-
-def _value(array: np.ndarray, hint: Any) -> Any:
-    """Return a stored array as the type `hint` of its field: camera, plain value, tuple, or the array itself."""
-    if hint is Camera:
-        width, height, *numbers = array.tolist()
-        return Camera(int(width), int(height), *numbers)
-    if hint in (str, bool, float, int):
-        return hint(array.item())
-    return tuple(array.tolist()) if getattr(hint, "__origin__", None) is tuple else array
+    width, height, *numbers = values["thermal_camera"]
+    return RigEstimate(**{**values, "thermal_camera": Camera(int(width), int(height), *numbers)})

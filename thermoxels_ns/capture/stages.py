@@ -18,10 +18,10 @@ from thermoxels_ns.capture.rig.start import read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.capture.scene_writer import Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.poses import find_poses
+from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, find_poses, read_poses
 from thermoxels_ns.capture.sfm.scale_and_up import scale_from_gps, scale_from_markers, upright
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, StageCache, fingerprint, load, prepare_output, save
+from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, StageCache, fingerprint, load_rig, prepare_output, save_rig
 from thermoxels_ns.core.checks import hold_folder, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.scene_scale import SceneScale
@@ -101,14 +101,15 @@ class _Capture:
         self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
         self.dropped |= search.unpaired
         read = self.temperatures(search.pairs)
-        found = self.poses(read)
+        found, colmap = self.poses(read)
         frames = [frame for frame in read.frames if frame.name in found.frames]
         scale, scale_missing = self.scale(found, frames)
         model, up = upright(found, frames)
         rig, start = self.rig(model, frames, read, scale)
         drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
         self.say(f"drift: {drift.explanation}")
-        scene = Scene(frames, model, rig, drift, scale, up)
+        moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
+        scene = Scene(frames, model, colmap, moved, rig, drift, scale, up)
         write_scene_folder(scene, self.output, self.say)
         result = CaptureResult(self.source, self.output, search.pairs, self.dropped, read, scene, start, scale_missing)
         write_page(result)
@@ -135,8 +136,8 @@ class _Capture:
         self.dropped |= read.dropped
         return read
 
-    def poses(self, read: CaptureFrames) -> SfmModel:
-        """Return camera, poses and scene points, which are found from the photographs."""
+    def poses(self, read: CaptureFrames) -> tuple[SfmModel, Path]:
+        """Return camera, poses and scene points, found from the photographs, and the folder of COLMAP's own model."""
         settings = self.settings
         names = ("image_size", "max_features", "lens", "seed", "threads")
         depends = {"options": {name: getattr(settings, name) for name in names}}
@@ -145,14 +146,14 @@ class _Capture:
             photographs = {frame.name: frame.photograph for frame in read.frames}
             focal = [frame.focal_px for frame in read.frames if frame.focal_px]
             middle = float(np.median(focal)) if focal else None
-            model = find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
-            save(folder / "model.npz", model)
-            self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
+            find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
 
-        model = load(self.cache.run("poses", depends, work) / "model.npz", SfmModel)
+        folder = self.cache.run("poses", depends, work)
+        model = read_poses(folder, [frame.name for frame in read.frames], read.photograph_size)
+        self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
         few = "too few matches with the largest group of photographs that fit together"
         self.dropped |= {frame.name: few for frame in read.frames if frame.name not in model.frames}
-        return model
+        return model, folder / MODEL_FOLDER
 
     def scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return metres per unit from markers, else from GPS; or None and the reason for None."""
@@ -181,8 +182,8 @@ class _Capture:
                 rig = estimate_rig(
                     rig_frames(model, frames), model.camera, begin, lambda line: self.say(f"rig: {line}")
                 )
-            save(folder / "rig.npz", rig)
+            save_rig(folder / "rig.npz", rig)
             self.say(f"rig: {rig.explanation}")
 
-        rig = load(self.cache.run("rig", depends, work) / "rig.npz", RigEstimate)
+        rig = load_rig(self.cache.run("rig", depends, work) / "rig.npz")
         return rig, begin

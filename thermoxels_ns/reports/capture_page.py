@@ -13,7 +13,7 @@ from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
-from thermoxels_ns.capture.scene_writer import scene_names
+from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.arrays import Float32Array, FloatArray

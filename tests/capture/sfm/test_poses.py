@@ -8,7 +8,7 @@ from tests.support.camera_card import write_pairs
 from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.poses import image_pairs, model_of_colmap
+from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, image_pairs, read_poses
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
@@ -63,16 +63,16 @@ MODEL = ring_model(5, points=60)
 
 
 def test_a_colmap_model_comes_in_with_its_points_at_the_photographs_own_size(tmp_path):
-    files = {f"{name}-visible.jpg": name for name in MODEL.frames}
-    write_colmap_model(tmp_path, list(files), MODEL.camera_to_world, CAMERA, MODEL.points, text=True)
-    found = model_of_colmap(pycolmap.Reconstruction(str(tmp_path)), files, (CAMERA.width, CAMERA.height))
+    write_colmap_model(tmp_path / MODEL_FOLDER, list("abcde"), MODEL.camera_to_world, CAMERA, MODEL.points)
+    found = read_poses(tmp_path, MODEL.frames, (CAMERA.width, CAMERA.height))
+    assert found.frames == MODEL.frames
     assert found.camera_to_world == pytest.approx(MODEL.camera_to_world, abs=1e-9)
     assert found.camera == CAMERA
     assert len(found.points) == len(MODEL.points)
     assert found.sighting_error_px().max() < 1e-6
     assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
     assert found.point_error_px == pytest.approx(0.5)
-    large = model_of_colmap(pycolmap.Reconstruction(str(tmp_path)), files, (1280, 960))
+    large = read_poses(tmp_path, MODEL.frames, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
     assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)
