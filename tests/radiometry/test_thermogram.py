@@ -70,7 +70,7 @@ def test_counts_of_an_unknown_camera_are_refused_with_the_choices(tmp_path):
     path = save_tiff(tmp_path / "a.tiff", counts_of(WALL_C, 0.04, -273.15), "FLIR", "Duo Pro R")
     with pytest.raises(ThermalFileError, match=r"counts of FLIR Duo Pro R.*flir-high-gain.*--celsius-per-count"):
         read_thermogram(path)
-    assert recognised_camera(None, None) is None and recognised_camera("Workswell", "WIRIS") is None
+    assert recognised_camera(None) is None and recognised_camera("Workswell WIRIS") is None
 
 
 def test_whole_numbers_in_an_array_need_a_unit(tmp_path):
