@@ -9,7 +9,7 @@ from tests.support.camera_card import write_pairs
 from tests.support.unreadable import files_end_after
 from thermoxels_ns.capture.rig_types import guessed_rig
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.stage_cache import StageCache, load_rig, prepare_output, save_rig
+from thermoxels_ns.capture.stage_cache import load_rig, prepare_output, run_stage, save_rig
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import hold_folder
@@ -22,10 +22,10 @@ def test_an_interrupted_stage_finds_what_it_left_and_a_changed_one_does_not(tmp_
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        StageCache(tmp_path).run("poses", {"size": 1}, interrupted)
+        run_stage(tmp_path / "poses", {"size": 1}, interrupted)
     found = []
-    StageCache(tmp_path).run("poses", {"size": 1}, lambda where: found.append((where / "half").exists()))
-    StageCache(tmp_path).run("poses", {"size": 2}, lambda where: found.append((where / "half").exists()))
+    for size in (1, 2):
+        run_stage(tmp_path / "poses", {"size": size}, lambda where: found.append((where / "half").exists()))
     assert found == [True, False]
 
 
@@ -37,24 +37,25 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     assert prepare_output(prepare_output(tmp_path / "new")) == tmp_path / "new"
 
 
-def run_stage(folder, from_stage=None):
+def ran(folder, again=False):
     """One stage that writes two files; returns what it found in its folder, None where it did not run."""
-    ran = []
+    found = []
 
     def work(where):
-        ran.append(sorted(path.name for path in where.iterdir() if path.name != "key.txt"))
+        found.append(sorted(path.name for path in where.iterdir() if path.name != "key.txt"))
         for name in ("a", "b"):
             (where / name).write_text(name)
 
-    where = StageCache(folder, from_stage).run("poses", {}, work)
-    assert sorted(path.read_text() for path in where.glob("?")) == ["a", "b"]
-    return ran[0] if ran else None
+    run_stage(folder, {}, work, again)
+    assert sorted(path.read_text() for path in folder.glob("?")) == ["a", "b"]
+    return found[0] if found else None
 
 
 @pytest.mark.parametrize("first", ["a", "b", "done", "key.txt"])
 def test_killed_while_an_old_result_is_removed(tmp_path, monkeypatch, first):
     """Without the rest of the folder, its key and its end must not stand for a result."""
-    run_stage(tmp_path)
+    stage = tmp_path / "poses"
+    ran(stage)
 
     def killed(folder, **_):
         (folder / first).unlink(missing_ok=True)
@@ -62,10 +63,10 @@ def test_killed_while_an_old_result_is_removed(tmp_path, monkeypatch, first):
 
     monkeypatch.setattr(shutil, "rmtree", killed)
     with pytest.raises(KeyboardInterrupt):
-        run_stage(tmp_path, "poses")
+        ran(stage, again=True)
     monkeypatch.undo()
-    assert run_stage(tmp_path) == []  # a part of an old result is no start either
-    assert run_stage(tmp_path) is None
+    assert ran(stage) == []  # a part of an old result is no start either
+    assert ran(stage) is None
 
 
 def test_a_result_that_does_not_fit_on_the_disk_is_one_error(tmp_path, monkeypatch):
@@ -83,29 +84,29 @@ def test_a_result_that_does_not_fit_on_the_disk_is_one_error(tmp_path, monkeypat
         np.testing.assert_array_equal(getattr(again, name), value)
 
 
-def test_every_change_of_the_input_is_noticed(tmp_path, monkeypatch):
+def test_every_change_of_photographs_and_their_options_is_noticed(tmp_path, monkeypatch):
     def refuse(*_):
         raise SceneError("no poses")
 
-    def temperatures_are_read_again(**more) -> bool:
-        said: list[str] = []
+    def key(**more) -> str:
         with pytest.raises(SceneError, match="no poses"):
-            capture_folder(card, scene, CaptureSettings(**more), said.append)
-        return "temperatures: as before" not in said
+            capture_folder(card, scene, CaptureSettings(**more))
+        return (scene / ".capture" / "poses" / "key.txt").read_text()
 
     monkeypatch.setattr("thermoxels_ns.capture.stages.find_poses", refuse)
     card, scene = write_pairs(tmp_path / "card", "abcd"), tmp_path / "scene"
-    assert temperatures_are_read_again() and not temperatures_are_read_again()
+    keys = [key()]
+    assert key() == keys[0]
     (card / "a-visible.jpg").touch()
-    assert temperatures_are_read_again()
+    keys.append(key())
     write_pairs(card, "e")
-    assert temperatures_are_read_again()
+    keys.append(key())
     (card / "e-radiometric.tiff").unlink()
-    assert temperatures_are_read_again()
+    keys += [key(), key(seed=1)]
+    assert keys[1] == keys[3] and len(set(keys)) == 4
     (card / "notes.txt").write_text("none of ours")
-    assert not temperatures_are_read_again()
-    assert temperatures_are_read_again(emissivity=0.9, reflected_c=20.0)
-    assert not temperatures_are_read_again(emissivity=0.9, reflected_c=20.0, seed=1)
+    (card / "a-radiometric.tiff").touch()
+    assert key() == key(emissivity=0.9, reflected_c=20.0) == keys[3]
 
 
 def test_a_second_capture_is_refused_and_changes_nothing(tmp_path):

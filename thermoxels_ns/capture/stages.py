@@ -21,7 +21,7 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, find_poses, read_poses
 from thermoxels_ns.capture.sfm.scale_and_up import scale_from_gps, scale_from_markers, upright
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, StageCache, fingerprint, load_rig, prepare_output, save_rig
+from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, fingerprint, load_rig, prepare_output, run_stage, save_rig
 from thermoxels_ns.core.checks import hold_folder, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.scene_scale import SceneScale
@@ -77,20 +77,18 @@ def run_capture(
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
-            cache = StageCache(folder, settings.from_stage, say)
-            return _Capture(source, folder, settings, cache, say).run(write_page)
+            return _Capture(source, folder, settings, say).run(write_page)
     finally:
         lock.release()
 
 
 @dataclass
 class _Capture:
-    """One capture while it runs. `temperatures`, `poses` and `rig`, which take minutes, keep what they find."""
+    """One capture while it runs. `poses` and `rig`, which take minutes, keep what they find."""
 
     source: Path
     output: Path
     settings: CaptureSettings
-    cache: StageCache
     say: Callable[[str], None]
     dropped: dict[str, str] = field(default_factory=dict)
     """Reason by name, for each file and frame that is left out; the stages add to this dictionary."""
@@ -101,15 +99,15 @@ class _Capture:
         self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
         self.dropped |= search.unpaired
         read = self.temperatures(search.pairs)
-        found, colmap = self.poses(read)
+        found, key = self.poses(read)
         frames = [frame for frame in read.frames if frame.name in found.frames]
         scale, scale_missing = self.scale(found, frames)
         model, up = upright(found, frames)
-        rig, start = self.rig(model, frames, read, scale)
+        rig, start = self.rig(model, frames, read, scale, key)
         drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
         self.say(f"drift: {drift.explanation}")
         moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
-        scene = Scene(frames, model, colmap, moved, rig, drift, scale, up)
+        scene = Scene(frames, model, self.kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)
         write_scene_folder(scene, self.output, self.say)
         result = CaptureResult(self.source, self.output, search.pairs, self.dropped, read, scene, start, scale_missing)
         write_page(result)
@@ -117,30 +115,25 @@ class _Capture:
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
-        settings = self.settings
-        library = [settings.dji_library] if settings.dji_library and settings.dji_library.is_file() else []
-        files = [self.source / name for pair in pairs for name in (pair.photograph, pair.thermal)]
-        depends = {
-            "files": fingerprint(files, self.source),
-            "options": {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)},
-            "library": fingerprint(library),
-            "skip_bad": settings.skip_bad,
-        }
-
-        def work(folder: Path) -> None:
-            read = read_frames(pairs, self.source, folder, settings, self.say)
-            width, height = read.thermal_size
-            self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
-
-        read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
+        read = read_frames(pairs, self.source, self.kept, self.settings, self.say)
+        width, height = read.thermal_size
+        self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
         self.dropped |= read.dropped
         return read
 
-    def poses(self, read: CaptureFrames) -> tuple[SfmModel, Path]:
-        """Return camera, poses and scene points, found from the photographs, and the folder of COLMAP's own model."""
+    @property
+    def kept(self) -> Path:
+        """Folder of what is found before the scene is written."""
+        return self.output / CACHE_FOLDER
+
+    def poses(self, read: CaptureFrames) -> tuple[SfmModel, str]:
+        """Return camera, poses and scene points, which are found from the photographs, and the key of this result."""
         settings = self.settings
         names = ("image_size", "max_features", "lens", "seed", "threads")
-        depends = {"options": {name: getattr(settings, name) for name in names}}
+        depends = {
+            "options": {name: getattr(settings, name) for name in names},
+            "files": fingerprint([self.source / frame.name for frame in read.frames], self.source),
+        }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
@@ -148,12 +141,13 @@ class _Capture:
             middle = float(np.median(focal)) if focal else None
             find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
 
-        folder = self.cache.run("poses", depends, work)
+        folder, again = self.kept / "poses", settings.from_stage == "poses"
+        key = run_stage(folder, depends, work, again, self.say)
         model = read_poses(folder, [frame.name for frame in read.frames], read.photograph_size)
         self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
         few = "too few matches with the largest group of photographs that fit together"
         self.dropped |= {frame.name: few for frame in read.frames if frame.name not in model.frames}
-        return model, folder / MODEL_FOLDER
+        return model, key
 
     def scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return metres per unit from markers, else from GPS; or None and the reason for None."""
@@ -167,23 +161,29 @@ class _Capture:
         return scale, missing
 
     def rig(
-        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None
+        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None, poses: str
     ) -> tuple[RigEstimate, RigEstimate]:
-        """Return the rig (found from the images, or given by the user) and the start of its search."""
+        """Return the rig (found from the images, or given by the user) and the start of its search.
+
+        `poses` is the key of the result that `model` came from.
+        """
         settings = self.settings
         angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
         begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
-        depends = {"angle": angle, "metres": metres, "rig": fingerprint([settings.rig] if settings.rig else [])}
+        if settings.rig is not None:
+            rig = read_rig(settings.rig, read.thermal_size, metres)
+        else:
+            depends = {
+                "options": {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)},
+                "start": [poses, angle, metres],
+                "files": fingerprint([self.source / frame.thermal_source for frame in read.frames], self.source),
+            }
 
-        def work(folder: Path) -> None:
-            if settings.rig is not None:
-                rig = read_rig(settings.rig, read.thermal_size, metres)
-            else:
-                rig = estimate_rig(
-                    rig_frames(model, frames), model.camera, begin, lambda line: self.say(f"rig: {line}")
-                )
-            save_rig(folder / "rig.npz", rig)
-            self.say(f"rig: {rig.explanation}")
+            def work(folder: Path) -> None:
+                say = lambda line: self.say(f"rig: {line}")  # noqa: E731
+                save_rig(folder / "rig.npz", estimate_rig(rig_frames(model, frames), model.camera, begin, say))
 
-        rig = load_rig(self.cache.run("rig", depends, work) / "rig.npz")
+            run_stage(self.kept / "rig", depends, work, settings.from_stage is not None, self.say)
+            rig = load_rig(self.kept / "rig" / "rig.npz")
+        self.say(f"rig: {rig.explanation}")
         return rig, begin
