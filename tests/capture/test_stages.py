@@ -86,7 +86,7 @@ def test_the_scene_is_that_of_the_truth_with_z_up(capture):
     assert off_m < 0.01 and off_deg < 0.3
     assert meta["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
     assert len(result.scene.model.points) > 200
-    assert np.median(result.scene.model.sighting_error_px()) < 0.5
+    assert np.median(result.scene.model.point_error_px) < 0.5
     assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
     # Up in each camera's axes, by the scene and by the truth.
     assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2, :3], poses(COUNT)[:, 2, :3]))).max() < 2.0
@@ -154,8 +154,9 @@ def test_names_of_files_are_no_markup(capture):
 def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     """A warm spot at the projection of a scene point appears at that point in the photograph."""
     model = ring_model(3)
-    seen, pixels = model.seen_by(1)
+    seen = model.seen[1]
     points = model.in_camera(1, model.points[seen])
+    pixels = model.camera.project(points)
     frame = RigFrame(np.zeros((480, 640)), np.zeros((60, 80)), points, seen)
     thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
     rig[:3, 3] = (0.3, -0.1, 0.05)
@@ -228,8 +229,8 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     assert tracks is not None
     np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
     np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
-    assert len(tracks.sighting_point) == len(scene.model.sighting_point)
-    seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
+    assert len(tracks.sighting_point) == sum(map(len, scene.model.seen))
+    seen = np.array([len(points) for points in scene.model.seen])
     train = [number for number, name in enumerate(tracks.frames) if "train" in name]
     assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
 

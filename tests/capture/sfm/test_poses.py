@@ -69,10 +69,9 @@ def test_a_colmap_model_comes_in_with_its_points_at_the_photographs_own_size(tmp
     assert found.camera_to_world == pytest.approx(MODEL.camera_to_world, abs=1e-9)
     assert found.camera == CAMERA
     assert len(found.points) == len(MODEL.points)
-    assert found.sighting_error_px().max() < 1e-6
-    assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
+    assert found.points == pytest.approx(MODEL.points, abs=1e-9)
+    assert [len(seen) for seen in found.seen] == len(MODEL.frames) * [len(MODEL.points)]
     assert found.point_error_px == pytest.approx(0.5)
     large = read_poses(tmp_path, MODEL.frames, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
-    assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)

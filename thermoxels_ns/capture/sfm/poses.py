@@ -174,28 +174,23 @@ def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> Sfm
     camera = reconstruction.cameras[posed[0].camera_id]
     values: dict[str, Any] = lens_entries(camera.model.name, camera.params)
     found = Camera(int(camera.width), int(camera.height), **values)
-    factor = np.array([size[0] / found.width, size[1] / found.height])
+    factor = 0.5 * (size[0] / found.width + size[1] / found.height)
     ids = sorted(reconstruction.points3D)
     points = [reconstruction.points3D[i] for i in ids]
     number = {i: n for n, i in enumerate(ids)}
-    poses, frames, seen, pixels = [], [], [], []
-    for index, image in enumerate(posed):
+    poses, seen = [], []
+    for image in posed:
         poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
-        # A scene point may have two features in one photograph; only the first feature is kept.
-        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
-        order = sorted(own)
-        frames += [index] * len(order)
-        seen += order
-        pixels += [own[point] for point in order]
+        # A scene point may have two features in one photograph.
+        own = {number[feature.point3D_id] for feature in image.points2D if feature.has_point3D()}
+        seen.append(np.array(sorted(own), dtype=np.int64))
     return SfmModel(
         tuple(names[image.image_id - 1] for image in posed),
         found.resized(*size),
         np.stack(poses),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
-        np.array(frames, dtype=np.int64),
-        np.array(seen, dtype=np.int64),
-        np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
+        np.array([point.error for point in points], dtype=np.float64) * factor,
+        tuple(seen),
     )
 
 
