@@ -56,7 +56,7 @@ def test_points_of_a_model_wherever_it_may_lie_make_lines_and_the_box(scene_fold
     add_model(scene, where)
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
-    assert len(tracks.sighting_frame) == 6 * 30
+    assert sum(map(len, tracks.seen.values())) == 6 * 30
     lines = lines_of(scene).metadata["feature_rays"]
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
     evidence = find_scene_box(read_scene_file(scene.path), None, range(len(NAMES)), tracks)
@@ -89,7 +89,7 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
     scene.rewrite()
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
-    assert set(tracks.sighting_frame.tolist()) == {0, 1, 2, 3, 5}
+    assert set(tracks.seen) == {one.name for one in frames} - {frames[4].name}
     assert frames[4].name in capsys.readouterr().out.replace("\n", "")
 
 
@@ -168,8 +168,7 @@ def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
     points = np.zeros((300, 3))  # a wall, seen by the photographs on one side of it
     points[:, 1:] = np.random.default_rng(3).uniform(-0.5, 0.5, (300, 2))
     front = [number for number, frame in enumerate(frames) if frame.pose[0, 3] > 0]
-    frame, point = (a.reshape(-1) for a in np.meshgrid(front, range(300), indexing="ij"))
-    tracks = SparseTracks(points, np.full(300, 0.5), tuple(one.name for one in frames), frame, point)
+    tracks = SparseTracks(points, np.full(300, 0.5), {frames[number].name: np.arange(300) for number in front})
     assert np.bincount(feature_rays(tracks, frames).point).tolist() == [len(front)] * 300
     middle = int(np.argmin(np.abs(points).sum(axis=1)))
     points[middle] += 0.1 * (np.mean([frames[number].pose[:3, 3] for number in front], axis=0) - points[middle])
@@ -203,7 +202,7 @@ def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
         pose = np.eye(4)
         pose[:3, 3] = (x, 0.0, 2.0)
         frames.append(replace(frame, name=str(number), pose=pose))
-    one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
+    one = SparseTracks(np.zeros((1, 3)), np.ones(1), {name: np.zeros(1, np.int64) for name in "012"})
     lines = feature_rays(one, frames)
     angle = 2.0 * np.arctan2(1.0, 2.0)
     expected = 1.0 / frame.intrinsics.fl_x / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])

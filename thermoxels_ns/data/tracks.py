@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,14 +33,12 @@ class SparseTracks:
 
     points: FloatArray  # shape (n, 3), in the coordinates of the poses
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    frames: tuple[str, ...]  # names of photographs, as ``file_path`` in transforms.json
-    sighting_frame: IntArray  # index into `frames` of each sighting, shape (s,)
-    sighting_point: IntArray  # index into `points` of each sighting, shape (s,)
+    seen: Mapping[str, IntArray]  # indices into `points`, by the photograph's ``file_path`` in transforms.json
     source: str = "tracks"  # folder of the COLMAP model
 
     def well_seen(self) -> FloatArray:
         """Return the points (m, 3) that enough photographs see with a small enough error (see `feature_rays`)."""
-        views = np.bincount(self.sighting_point, minlength=len(self.points))
+        views = np.bincount(np.concatenate([*self.seen.values()]), minlength=len(self.points))
         return self.points[(views >= FEWEST_VIEWS) & (self.point_error_px <= MOST_ERROR_PX)]
 
 
@@ -65,12 +63,6 @@ def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseT
         raise SceneError(f"it has no photograph of this scene, or several of one name ({names})")
     listed = list(images.values())
     found, frames = [listed[image] for image, _ in pairs], [scene.frames[frame] for _, frame in pairs]
-    number = {image.id: place for place, image in enumerate(found)}
-    # A track may hold two features of one photograph.
-    seen = [(place, number[i]) for place, one in enumerate(points.values()) for i in {*one.image_ids} & number.keys()]
-    if not seen:
-        raise SceneError("it has no points that photographs of this scene see")
-    point, frame = np.array(sorted(seen), dtype=np.int64).T
     widths = [f.intrinsics.width / max(cameras[image.camera_id].width, 1) for f, image in zip(frames, found)]
     error_px = np.array([float(one.error) for one in points.values()])
     # COLMAP writes -1 for an error that it did not compute; such a point counts as the worst that is used.
@@ -95,8 +87,13 @@ def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseT
         strays = ", ".join(one.name for one, good in zip(frames, agree) if not good)
         say(f"Tracks: other poses than COLMAP's, left out: {strays}")
     moved = np.array([one.xyz for one in points.values()]) @ world[:3, :3].T + world[:3, 3]
-    kept, names = agree[frame], tuple(one.name for one in frames)
-    return SparseTracks(moved, error_px, names, frame[kept], point[kept], folder)
+    row = {point: number for number, point in enumerate(points)}
+    # A photograph may show a point by two features.
+    shown = [sorted({row[point] for point in image.point3D_ids.tolist() if point in row}) for image in found]
+    seen = {f.name: np.array(some, dtype=np.int64) for f, some, good in zip(frames, shown, agree) if good}
+    if not any(map(len, seen.values())):
+        raise SceneError("it has no points that photographs of this scene see")
+    return SparseTracks(moved, error_px, seen, folder)
 
 
 def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
@@ -110,15 +107,14 @@ def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
     Raises:
         SceneError: No frame is in `tracks`, or `tracks` are of other poses.
     """
-    place = {frame.name: number for number, frame in enumerate(frames)}
-    number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
-    if not (number >= 0).any():
+    seen = [tracks.seen.get(one.name, np.zeros(0, dtype=np.int64)) for one in frames]
+    point, frame = np.concatenate(seen), np.repeat(np.arange(len(frames)), [len(some) for some in seen])
+    if not len(point):
         raise SceneError("it has no photograph that trains")
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
-    used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
-    # Sorted by point, each pair once: a photograph that sees a point twice counts once.
-    pairs = np.unique(tracks.sighting_point[used] * len(frames) + number[tracks.sighting_frame[used]])
-    point, frame = np.divmod(pairs, len(frames))
+    order = np.argsort(point, kind="stable")
+    order = order[known[point[order]]]
+    point, frame = point[order], frame[order]
     poses = np.stack([one.pose for one in frames])
     focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
     line = tracks.points[point] - poses[frame, :3, 3]
