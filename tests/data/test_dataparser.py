@@ -179,7 +179,7 @@ def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_traini
     else:
         assert not given[1].shares_camera and averaged.shape == thermal.shape
     held_out = parse(scene.path, "val", photographs_gb=room)
-    assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["thermal_averaged"] == 1
+    assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["image_scale"] == 1.0
     typed = parse(scene.path, photographs_gb=room, downscale_factor=1)
     assert int(typed.cameras.width[0]) == 25, "all pixels, as asked"
 

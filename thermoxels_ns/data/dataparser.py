@@ -118,10 +118,9 @@ class ThermalDataParser(DataParser):
 
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
-    and resolution), ``thermal_unit``, ``image_scale`` (1 / downscale_factor),
-    ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
-    ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
-    scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
+    and resolution), ``thermal_unit``, ``image_scale`` (1 / pixels that become one, along a side), ``pixel_size`` (width
+    of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the scene box in input
+    coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
     coordinates), and ``fitted_poses`` of val and test are camera to world in nerfstudio's world, (n, 3, 4); else None.
     """
@@ -166,7 +165,6 @@ class ThermalDataParser(DataParser):
                 "image_scale": factor,
                 "thermal_filenames": [frame.thermal for frame in frames] if scene.file.has_thermal else None,
                 "thermal_cameras": None if shared else thermal_cameras,
-                "thermal_averaged": pixels_averaged if shared else 1,
                 "pixel_size": scene.metadata["pixel_size"] / factor,
                 "feature_rays": scene.feature_rays if training else None,
                 "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,

@@ -142,7 +142,8 @@ class ThermalDataset(InputDataset):
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0)
-            if (side := given.get("thermal_averaged", 1)) > 1:
+            side = round(1.0 / given["image_scale"])  # pixels of the photograph that became one, along a side
+            if side > 1 and given["thermal_cameras"] is None:
                 thermal, valid = _averaged(thermal, valid, side)
             thermal = thermal.astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
