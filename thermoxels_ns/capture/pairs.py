@@ -94,8 +94,8 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
     named, unclear = _by_names(photographs, thermal, found.folder)
     used = {file.path for pair in named for file in pair[:2]}
     used |= {file.path for file in thermal if file.role == "thermal picture" and file.path in unclear}
-    left = ([file for file in side if file.path not in used] for side in (photographs, thermal))
-    timed, explained = _by_time(*left, time_limit_s, clock_offset_s)
+    left = [[file for file in side if file.path not in used] for side in (photographs, thermal)]
+    timed, explained = _by_time(left[0], left[1], time_limit_s, clock_offset_s)
     pairs = [*both, *named, *timed]
     paired = {file.path for pair in timed for file in pair[:2]}
     unpaired = explained | {path: why for path, why in unclear.items() if path not in paired}

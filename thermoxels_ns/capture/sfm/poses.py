@@ -185,7 +185,7 @@ def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> Sfm
         own = {number[feature.point3D_id] for feature in image.points2D if feature.has_point3D()}
         seen.append(np.array(sorted(own), dtype=np.int64))
     return SfmModel(
-        tuple(names[image.image_id - 1] for image in posed),
+        tuple(names[int(image.image_id) - 1] for image in posed),
         found.resized(*size),
         np.stack(poses),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
