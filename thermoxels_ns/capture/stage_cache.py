@@ -15,7 +15,7 @@ import numpy as np
 from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.version import __version__
 
 CACHE_FOLDER = ".capture"
@@ -57,20 +57,10 @@ def run_stage(
     return key
 
 
-def fingerprint(paths: Sequence[Path], root: Path | None = None) -> list[tuple[str, int, int]]:
-    """Return name (relative to `root`, if given), size [bytes] and time of change [ns] of each file.
-
-    Raises `SceneError` for a missing file.
-    """
-    rows = []
-    for path in paths:
-        if not path.is_file():
-            remedy = "Check the path, or leave it out."
-            raise SceneError(str(path), expected="a file", got="nothing there", remedy=remedy)
-        status = path.stat()
-        name = path if root is None else path.relative_to(root)
-        rows.append((name.as_posix(), status.st_size, status.st_mtime_ns))
-    return rows
+def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:
+    """Return name (relative to `root`), size [bytes] and time of change [ns] of each file."""
+    found = ((path.relative_to(root).as_posix(), path.stat()) for path in paths)
+    return [(name, status.st_size, status.st_mtime_ns) for name, status in found]
 
 
 def prepare_output(folder: Path) -> Path:
