@@ -211,7 +211,7 @@ def test_numbers_come_back_as_they_went_in(written):
         in_thermal = (point - thermal_pose[:3, 3]) @ thermal_pose[:3, :3] * (1, -1, -1)
         rig = scene.rig.visible_to_thermal
         assert in_thermal == pytest.approx(in_visible @ rig[:3, :3].T + rig[:3, 3])
-        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit).temperature_c
+        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit)
         expected = np.load(frame.thermal) - scene.drift.offsets_k[number] - scene.drift.radial_k(160, 128)
         np.testing.assert_allclose(written_c, expected, atol=1e-4)
         assert (folder / entry["file_path"]).read_bytes() == frame.photograph.read_bytes()

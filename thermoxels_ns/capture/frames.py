@@ -137,7 +137,7 @@ def _read(
         gps=facts.gps or holder.gps,
         gimbal_deg=facts.gimbal_deg or holder.gimbal_deg,
         thermal_focal_px=thermal_focal,
-        masked=thermogram.report.masked,
+        masked=int(np.isnan(thermogram.temperature_c).sum()),
     )
     height, width = thermogram.temperature_c.shape
     return frame, ((facts.width, facts.height), (width, height))

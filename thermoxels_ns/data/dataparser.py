@@ -310,7 +310,7 @@ def survey_thermal_files(
     middles: dict[Path, float] = {}
     low, high = bounds_c or (math.inf, -math.inf)
     for path in paths:
-        temperature_c = read_thermal_file(path, unit).temperature_c
+        temperature_c = read_thermal_file(path, unit)
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():

@@ -19,9 +19,7 @@ from thermoxels_ns.radiometry.measurement_model import (
     corrected_temperature_c,
 )
 from thermoxels_ns.radiometry.thermal_pixels import (
-    PixelReport,
     ThermalFormat,
-    ThermalImage,
     ThermalUnit,
     detect_format,
     masked_image,
@@ -72,7 +70,6 @@ class Thermogram:
 
     temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where masked
     metadata: ThermogramMetadata
-    report: PixelReport  # numbers of masked pixels by reason
 
 
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
@@ -98,12 +95,12 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         if found == "FLIR R-JPEG":
             flir = read_flir_jpeg(path)
             conditions = options.applied_to(flir.camera.conditions)
-            image = masked_image(flir.temperature_c(conditions), saturated=flir.outside_calibration)
+            temperature_c = masked_image(flir.temperature_c(conditions))
             camera, angle = flir.camera.model, flir.camera.field_of_view_deg
             metadata = ThermogramMetadata(found, camera, angle, conditions, flir.picture_in_picture)
         elif found == "DJI R-JPEG":
             temperature_c, conditions = read_dji_rjpeg(path, options)
-            image = masked_image(temperature_c)
+            temperature_c = masked_image(temperature_c)
             with Image.open(path) as opened:
                 metadata = ThermogramMetadata(found, read_exif_facts(opened)[0], conditions=conditions)
         elif found == "JPEG":
@@ -113,13 +110,13 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
         else:
-            image, metadata = _read_stored(path, found, options)
-    return Thermogram(image.temperature_c, metadata, image.report)
+            temperature_c, metadata = _read_stored(path, found, options)
+    return Thermogram(temperature_c, metadata)
 
 
 def _read_stored(
     path: Path, found: ThermalFormat, options: RadiometryOptions
-) -> tuple[ThermalImage, ThermogramMetadata]:
+) -> tuple[Float32Array, ThermogramMetadata]:
     """Read a file of apparent temperatures or of counts linear in temperature; correct for the user's conditions."""
     unit, camera, picture = _given_unit(options), None, found in ("TIFF", "PNG")
     if picture and size_of_double_tiff(path) is None:
@@ -140,13 +137,13 @@ def _read_stored(
                 raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
             unit = COUNT_SCALES[preset][0]
     unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
-    image = read_thermal_file(path, unit)
+    temperature_c = read_thermal_file(path, unit)
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if picture and unit.kind == "linear" else None
     metadata = ThermogramMetadata(found, camera, conditions=conditions, celsius_per_count=per_count)
     if conditions != Conditions():
-        image = masked_image(corrected_temperature_c(image.temperature_c, conditions))
-    return image, metadata
+        temperature_c = masked_image(corrected_temperature_c(temperature_c, conditions))
+    return temperature_c, metadata
 
 
 def _given_unit(options: RadiometryOptions) -> ThermalUnit | None:
