@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
@@ -26,6 +28,16 @@ class Views:
     focal: FloatArray  # Focal lengths along x and y, shape (c, 2), [pixels]
     centre: FloatArray  # Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]
     size: IntArray  # Image widths and heights, shape (c, 2), [pixels]
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], poses: Sequence[FloatArray]) -> Views:
+        """Return the views of cameras, without their distortion, whose poses are (3, 4) or (4, 4), see above.
+
+        Where a lens distorts, a view may end a little inside or outside the border of the photograph.
+        """
+        pairs = (("fl_x", "fl_y"), ("cx", "cy"), ("width", "height"))
+        parts = (np.array([[getattr(camera, name) for name in pair] for camera in cameras]) for pair in pairs)
+        return cls(np.stack([pose[:3] for pose in poses]), *parts)
 
     def matrices(self) -> FloatArray:
         """Return matrices, (c, 3, 4), from points (x, y, z, 1) to depth * (column, row, 1), with depth > 0 ahead."""

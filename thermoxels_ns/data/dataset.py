@@ -18,6 +18,7 @@ from torch import Tensor
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
 from thermoxels_ns.radiometry.decoders import errors_name
@@ -64,6 +65,11 @@ class ThermalDataset(InputDataset):
         """Return the pose of the camera that `camera` returns: camera to world, OpenGL axes, shape (3, 4)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         return cameras.camera_to_worlds[image_idx].double().numpy()
+
+    def views(self, thermal: bool = False) -> Views:
+        """Return the photographs' cameras, or with `thermal` those in `thermal_cameras`, as views."""
+        numbers = range(len(self))
+        return Views.of([self.camera(n, thermal) for n in numbers], [self.pose(n, thermal) for n in numbers])
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Return a photograph at the resolution of its camera, shape (h, w, 3), or raise `SceneError`."""
