@@ -7,7 +7,7 @@ from PIL import Image
 
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
-from thermoxels_ns.capture.frames import CaptureFrames, read_frames
+from thermoxels_ns.capture.frames import read_frames
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.capture.settings import CaptureSettings
@@ -34,21 +34,6 @@ def test_degrees_and_what_the_files_say(tmp_path):
     assert (frame.focal_px, frame.camera) == (40.0, "Workswell WIRIS Pro")
     assert (frame.name, frame.thermal_source) == ("a-visible.jpg", "a-radiometric.tiff")
     assert (frames.photograph_size, frames.thermal_size) == ((32, 24), (16, 12))
-
-
-def test_the_list_survives_a_move_of_both_folders(tmp_path):
-    flir = FlirFile(np.full((12, 16), 14000, dtype=np.uint16), photograph=jpeg_bytes(np.zeros((24, 32, 3), np.uint8)))
-    card = tmp_path / "card"
-    first = pair(card, "a", gps=(48.0, 11.0, 500.0))
-    (card / "F.jpg").write_bytes(flir.jpeg())
-    frames = read([first, Pair("F.jpg", "F.jpg", "both in one file")], tmp_path)
-    (tmp_path / "work").rename(tmp_path / "work2")
-    card.rename(tmp_path / "card2")
-    loaded = CaptureFrames.load(tmp_path / "work2", tmp_path / "card2")
-    assert [frame.name for frame in loaded.frames] == ["a-visible.jpg", "F.jpg"]
-    assert loaded.frames[0].gps == frames.frames[0].gps
-    for frame in loaded.frames:
-        assert frame.photograph.is_file() and frame.thermal.is_file()
 
 
 def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):

@@ -13,8 +13,9 @@ from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses,
 from thermoxels_ns import cli
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
-from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
+from thermoxels_ns.capture.scene_writer import write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
@@ -22,7 +23,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.scene_scale import SceneScale, scale_from_scene_file, up_from_scene_file
-from thermoxels_ns.data.tracks import read_tracks
+from thermoxels_ns.data.tracks import find_tracks
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
 
@@ -85,7 +86,7 @@ def test_the_scene_is_that_of_the_truth_with_z_up(capture):
     assert off_m < 0.01 and off_deg < 0.3
     assert meta["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
     assert len(result.scene.model.points) > 200
-    assert np.median(result.scene.model.sighting_error_px()) < 0.5
+    assert np.median(result.scene.model.point_error_px) < 0.5
     assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
     # Up in each camera's axes, by the scene and by the truth.
     assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2, :3], poses(COUNT)[:, 2, :3]))).max() < 2.0
@@ -153,8 +154,9 @@ def test_names_of_files_are_no_markup(capture):
 def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     """A warm spot at the projection of a scene point appears at that point in the photograph."""
     model = ring_model(3)
-    seen, pixels = model.seen_by(1)
+    seen = model.seen[1]
     points = model.in_camera(1, model.points[seen])
+    pixels = model.camera.project(points)
     frame = RigFrame(np.zeros((480, 640)), np.zeros((60, 80)), points, seen)
     thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
     rig[:3, 3] = (0.3, -0.1, 0.05)
@@ -209,7 +211,7 @@ def test_numbers_come_back_as_they_went_in(written):
         in_thermal = (point - thermal_pose[:3, 3]) @ thermal_pose[:3, :3] * (1, -1, -1)
         rig = scene.rig.visible_to_thermal
         assert in_thermal == pytest.approx(in_visible @ rig[:3, :3].T + rig[:3, 3])
-        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit).temperature_c
+        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit)
         expected = np.load(frame.thermal) - scene.drift.offsets_k[number] - scene.drift.radial_k(160, 128)
         np.testing.assert_allclose(written_c, expected, atol=1e-4)
         assert (folder / entry["file_path"]).read_bytes() == frame.photograph.read_bytes()
@@ -223,12 +225,13 @@ def test_numbers_come_back_as_they_went_in(written):
 def test_tracks_say_which_training_photograph_sees_which_point(written):
     scene, folder = written
     outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
-    tracks = read_tracks(folder / TRACKS_NAME)
-    assert np.array_equal(tracks.points, scene.model.points)
-    assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
-    seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
-    train = [number for number, name in enumerate(tracks.frames) if "train" in name]
-    assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
+    tracks = find_tracks(read_scene_file(folder))
+    assert tracks is not None
+    np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
+    np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
+    assert sorted(map(len, tracks.seen.values())) == sorted(map(len, scene.model.seen))
+    train = sum(len(points) for name, points in tracks.seen.items() if "train" in name)
+    assert 0.5 * train < len(outputs.metadata["feature_rays"].origins) <= train
 
 
 def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, monkeypatch):
@@ -241,7 +244,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, m
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_tracks", stop)
+    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_json", stop)
     with pytest.raises(KeyboardInterrupt):
         write_scene_folder(scene, folder)
     assert (folder / "transforms.json").read_bytes() == before
@@ -257,39 +260,27 @@ def test_the_json_has_no_nan(written):
     assert "metres_per_unit" not in content
 
 
-def test_a_second_run_takes_everything_from_the_first(capture):
+def test_a_second_run_takes_what_took_minutes_from_the_first(capture):
     card, scene, first, _ = capture
-    before = (scene / "transforms.json").stat().st_mtime_ns
-    said = []
+    said, before = [], content(scene)
     again = capture_folder(card, scene, settings(skip_bad=True), said.append)
-    assert [line for line in said if "as before" not in line] == []
-    assert [line[:3] for line in said] == [f"{number}/8" for number in range(1, 9)]
-    assert (scene / "transforms.json").stat().st_mtime_ns == before
-    assert again.dropped == first.dropped
-    assert np.array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
-    assert np.array_equal(again.scene.drift.offsets_k, first.scene.drift.offsets_k)
+    assert [line for line in said if "as before" in line] == ["poses: as before", "rig: as before"]
+    assert content(scene) == before and again.dropped == first.dropped
 
 
-def test_markers_and_a_given_rig_run_only_what_depends_on_them_and_so_does_from_stage(capture, tmp_path):
-    card, earlier, _, _ = capture
+def test_a_given_rig_is_taken_and_from_stage_finds_it_again(capture, tmp_path):
+    card, earlier, first, _ = capture
     scene = tmp_path / "scene"
     shutil.copytree(earlier, scene)
-    said = []
-    more = {"skip_bad": True, "rig": earlier / "transforms.json"}
-    more["marker_side_m"] = 0.2
+    said: list[str] = []
+    more = {"skip_bad": True, "rig": earlier / "transforms.json", "marker_side_m": 0.2}
     result, given = capture_folder(card, scene, settings(**more), said.append), content(earlier)
     assert content(scene)["rig"] == given["rig"] and content(scene)["thermal_camera"] == given["thermal_camera"]
     assert result.scene.drift.used
-    assert [line.split(":")[0] for line in said if "as before" in line] == [
-        "1/8 pairs",
-        "2/8 temperatures",
-        "3/8 poses",
-    ]
     assert result.scene.scale is None and "no photograph shows an ArUco marker" in result.scale_missing
-    said.clear()
-    capture_folder(card, scene, settings(from_stage="scene", **more), said.append)
-    ran = [line for line in said if re.match(r"\d/8", line) and "as before" not in line]
-    assert ran == ["7/8 scene", "8/8 page"]
+    again = capture_folder(card, scene, settings(from_stage="rig", skip_bad=True), said.append)
+    assert [line for line in said if "as before" in line] == 2 * ["poses: as before"]
+    np.testing.assert_array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
 
 
 def test_the_command(capture, tmp_path, capsys):

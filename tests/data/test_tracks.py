@@ -1,4 +1,4 @@
-"""Sparse points and who sees them: from a file of tracks, from a COLMAP model, as lines of sight in training."""
+"""Sparse points and who sees them: from a COLMAP model, as lines of sight in training."""
 
 from dataclasses import replace
 
@@ -8,19 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.colmap_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, matched_names
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.tracks import (
-    MOST_ERROR_PX,
-    TRACKS_KEY,
-    SparseTracks,
-    feature_rays,
-    find_tracks,
-    write_tracks,
-)
+from thermoxels_ns.data.tracks import MOST_ERROR_PX, SparseTracks, feature_rays, find_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -33,29 +25,19 @@ def scene(scene_folder):
     return scene_folder(frames=len(NAMES), names=NAMES, scene_box=[[-1, -1, -1], [1, 1, 1]])
 
 
-@pytest.fixture
-def tracked(scene):
-    """The scene with a file of tracks in which all photographs see all points."""
-    files = tuple(entry["file_path"] for entry in scene.meta["frames"])
-    frame, point = (axis.reshape(-1) for axis in np.meshgrid(range(len(files)), range(30), indexing="ij"))
-    tracks = SparseTracks(POINTS, np.full(30, 0.5), files, frame, point)
-    scene.meta[TRACKS_KEY] = "tracks.npz"
-    scene.rewrite()
-    write_tracks(scene.path / "tracks.npz", tracks)
-    return scene, tracks
-
-
 def frames_of(folder, side=""):
     return [frame for frame in read_scene_file(folder.path).frames if side in frame.name]
 
 
-def add_model(folder, where="colmap/sparse/0", frames=None, names=None, focal_factor=1.0, **more) -> None:
+def add_model(
+    folder, where="colmap/sparse/0", frames=None, names=None, focal_factor=1.0, points=POINTS, **more
+) -> None:
     frames = frames_of(folder) if frames is None else frames
     lens, names = frames[0].intrinsics, names or [frame.image.name for frame in frames]
     camera = Camera(lens.width, lens.height, lens.fl_x, lens.fl_y, lens.cx, lens.cy)
     camera = camera.resized(*(round(side * focal_factor) for side in (lens.width, lens.height)))
     poses = [frame.pose for frame in frames]
-    write_colmap_model(folder.path / where, names, poses, camera, POINTS, **{"lens": "PINHOLE", **more})
+    write_colmap_model(folder.path / where, names, poses, camera, points, **{"lens": "PINHOLE", **more})
 
 
 def tracks_of(folder) -> SparseTracks:
@@ -74,7 +56,7 @@ def test_points_of_a_model_wherever_it_may_lie_make_lines_and_the_box(scene_fold
     add_model(scene, where)
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
-    assert len(tracks.sighting_frame) == 6 * 30
+    assert sum(map(len, tracks.seen.values())) == 6 * 30
     lines = lines_of(scene).metadata["feature_rays"]
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
     evidence = find_scene_box(read_scene_file(scene.path), None, range(len(NAMES)), tracks)
@@ -99,16 +81,6 @@ def test_without_a_model_and_switched_off_there_are_no_lines(scene):
     assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
 
 
-def test_the_file_that_the_json_names_comes_first(tracked):
-    scene, tracks = tracked
-    add_model(scene)
-    few = tracks.sighting_point < 7
-    some = {"sighting_frame": tracks.sighting_frame[few], "sighting_point": tracks.sighting_point[few]}
-    write_tracks(scene.path / "tracks.npz", replace(tracks, **some))
-    assert len(lines_of(scene).metadata["feature_rays"].points) == 7
-    assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
-
-
 def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys):
     frames = frames_of(scene)
     add_model(scene, frames=frames)
@@ -117,7 +89,7 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
     scene.rewrite()
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
-    assert set(tracks.sighting_frame.tolist()) == {0, 1, 2, 3, 5}
+    assert set(tracks.seen) == {one.name for one in frames} - {frames[4].name}
     assert frames[4].name in capsys.readouterr().out.replace("\n", "")
 
 
@@ -141,6 +113,7 @@ def _changed(scene, name: str, change, **options) -> None:
         (lambda s, f: add_model(s, frames=_turned(f, 0.25)), "poses are others"),
         (lambda s, f: add_model(s, names=[f"other_{n}.jpg" for n in range(6)]), "no photograph of this scene"),
         (lambda s, f: add_model(s, frames=f[:2]), "2 of 2 photographs agree"),
+        (lambda s, f: add_model(s, points=POINTS + np.array([0.0, 0.0, 100.0])), "behind the photographs"),
         (lambda s, f: _changed(s, "points3D.bin", lambda _: b""), "cannot be read"),
         *(
             (lambda s, f, name=name: _changed(s, name, lambda b: b[:-1]), "cannot be read")
@@ -174,9 +147,9 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders():
         assert matched_names(["1.jpg"], files) == [(0, 0)]  # whole names count before names without suffixes
 
 
-def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(tracked):
-    folder, tracks = tracked
-    outputs = lines_of(folder)
+def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(scene):
+    add_model(scene)
+    outputs = lines_of(scene)
     lines = outputs.metadata["feature_rays"]
     centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
     assert len(lines.origins) == 5 * 30
@@ -184,32 +157,29 @@ def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_w
     assert nearest.min(axis=1).max() < 1e-5
     assert np.bincount(nearest.argmin(axis=1)).tolist() == [30] * 5
     transform = outputs.dataparser_transform.double().numpy()
-    moved = outputs.dataparser_scale * (tracks.points @ transform[:, :3].T + transform[:, 3])
+    moved = outputs.dataparser_scale * (tracks_of(scene).points @ transform[:, :3].T + transform[:, 3])
     assert lines.points == pytest.approx(moved, abs=1e-6)
     assert (np.diff(lines.point) >= 0).all()
-    assert lines_of(folder, "val").metadata["feature_rays"] is None
+    assert lines_of(scene, "val").metadata["feature_rays"] is None
 
 
-def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(tracked):
-    folder, tracks = tracked
-    points = np.zeros((300, 3))  # a wall, seen by the three photographs on one side of it
+def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
+    frames = frames_of(scene, "train")
+    points = np.zeros((300, 3))  # a wall, seen by the photographs on one side of it
     points[:, 1:] = np.random.default_rng(3).uniform(-0.5, 0.5, (300, 2))
-    centres = np.array([np.array(entry["transform_matrix"])[:3, 3] for entry in folder.meta["frames"]])
-    frame, point = (a.reshape(-1) for a in np.meshgrid(np.flatnonzero(centres[:, 0] > 0), range(300), indexing="ij"))
-    tracks = SparseTracks(points, np.full(300, 0.5), tracks.frames, frame, point)
-    write_tracks(folder.path / "tracks.npz", tracks)
-    assert np.bincount(lines_of(folder).metadata["feature_rays"].point).tolist() == [3] * 300
+    front = [number for number, frame in enumerate(frames) if frame.pose[0, 3] > 0]
+    tracks = SparseTracks(points, np.full(300, 0.5), {frames[number].name: np.arange(300) for number in front})
+    assert np.bincount(feature_rays(tracks, frames).point).tolist() == [len(front)] * 300
     middle = int(np.argmin(np.abs(points).sum(axis=1)))
-    points[middle] += 0.1 * (centres[centres[:, 0] > 0].mean(axis=0) - points[middle])
-    write_tracks(folder.path / "tracks.npz", tracks)
-    lines = lines_of(folder).metadata["feature_rays"]
+    points[middle] += 0.1 * (np.mean([frames[number].pose[:3, 3] for number in front], axis=0) - points[middle])
+    lines = feature_rays(tracks, frames)
     assert len(lines.points) == 300
     assert sorted(set(range(300)) - set(lines.point.tolist())) == [middle]
 
 
-def test_badly_known_points_and_those_behind_a_camera_are_left_out(tracked):
-    folder, tracks = tracked
-    frames = frames_of(folder, "train")
+def test_badly_known_points_and_those_behind_a_camera_are_left_out(scene):
+    add_model(scene)
+    tracks, frames = tracks_of(scene), frames_of(scene, "train")
     error, points = tracks.point_error_px.copy(), tracks.points.copy()
     error[:4] = 3.0
     points[4] = np.nan
@@ -225,52 +195,15 @@ def test_badly_known_points_and_those_behind_a_camera_are_left_out(tracked):
         assert len(feature_rays(tracks, some).points) == 0
 
 
-def test_a_model_whose_points_lie_behind_the_cameras_is_left_out_and_said(scene_folder, capsys):
-    scene = scene_folder(frames=len(NAMES), names=NAMES)
-    frames = frames_of(scene)
-    lens, poses = frames[0].intrinsics, [frame.pose for frame in frames]
-    camera = Camera(lens.width, lens.height, lens.fl_x, lens.fl_y, lens.cx, lens.cy)
-    names, behind = [frame.image.name for frame in frames], POINTS + np.array([0.0, 0.0, 100.0])
-    write_colmap_model(scene.path / "sparse/0", names, poses, camera, behind, lens="PINHOLE")
-    assert lines_of(scene).metadata["feature_rays"] is None
-    assert "the COLMAP model is not used" in " ".join(capsys.readouterr().out.split())
-
-
-def test_the_error_of_a_length_is_that_of_a_triangulation(tracked):
-    folder, _ = tracked
-    frame = frames_of(folder)[0]
+def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
+    frame = frames_of(scene)[0]
     frames = []
     for number, x in enumerate((-1.0, 0.0, 1.0)):
         pose = np.eye(4)
         pose[:3, 3] = (x, 0.0, 2.0)
         frames.append(replace(frame, name=str(number), pose=pose))
-    one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
+    one = SparseTracks(np.zeros((1, 3)), np.ones(1), {name: np.zeros(1, np.int64) for name in "012"})
     lines = feature_rays(one, frames)
     angle = 2.0 * np.arctan2(1.0, 2.0)
     expected = 1.0 / frame.intrinsics.fl_x / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
     assert lines.uncertainty == pytest.approx(expected)
-
-
-def _rewritten(**changes):
-    """Write tracks in which some arrays are others, made of those that are there."""
-    return lambda path, tracks: write_tracks(path, replace(tracks, **{k: make(tracks) for k, make in changes.items()}))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "named"),
-    [
-        (_rewritten(frames=lambda _: tuple(f"other_{n}" for n in range(6))), "photographs of this scene.*other_0"),
-        (_rewritten(points=lambda tracks: tracks.points + np.array([0.0, 0.0, 100.0])), "behind"),
-        (_rewritten(sighting_point=lambda tracks: tracks.sighting_point + 1), "pairs of their numbers"),
-        (lambda path, _: path.write_bytes(b""), "points"),
-        (lambda path, _: path.write_bytes(b"not a zip"), "points"),
-        (lambda path, _: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "points"),
-        (lambda path, tracks: np.savez(path, points=tracks.points), "point_error_px"),
-        (lambda path, _: path.unlink(), "points"),
-    ],
-)
-def test_files_of_tracks_that_cannot_be_used_are_refused(tracked, spoil, named):
-    folder, tracks = tracked
-    spoil(folder.path / "tracks.npz", tracks)
-    with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
-        lines_of(folder)

@@ -17,7 +17,6 @@ from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import _read_ply
-from thermoxels_ns.data.tracks import read_tracks
 from thermoxels_ns.radiometry.thermogram import read_thermogram
 from thermoxels_ns.training.pipeline import load_checkpoint
 
@@ -28,7 +27,6 @@ def read_rig_photograph(path: Path) -> None:
 
 
 READERS = {
-    "tracks.npz": read_tracks,
     "points.ply": _read_ply,
     "any.json": read_json,
     "any.yaml": read_yaml,

@@ -24,7 +24,7 @@ def save(path: Path, pixels: np.ndarray) -> Path:
 @pytest.mark.parametrize("kind", [np.uint16, np.uint8])
 def test_bounds_keep_every_step_of_eight_and_sixteen_bits(tmp_path, kind):
     counts = np.arange(np.iinfo(kind).max + 1, dtype=kind).reshape(16, -1)
-    got = read_thermal_file(save(tmp_path / "a.png", counts), BOUNDS).temperature_c
+    got = read_thermal_file(save(tmp_path / "a.png", counts), BOUNDS)
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, -10.0 + counts / counts.max() * 50.0, atol=4e-6)
     assert len(np.unique(got)) == counts.size
@@ -34,40 +34,37 @@ def test_equal_channels_count_as_grey_and_keep_sixteen_bits(tmp_path):
     counts = np.array([[0, 1, 65535], [40000, 40001, 3]], np.uint16)
     for name in ("deep.png", "deep.tiff"):
         assert cv2.imwrite(str(tmp_path / name), np.repeat(counts[..., None], 3, axis=2))
-        unsaturated = read_thermal_file(tmp_path / name, COUNTS).temperature_c[1]
+        unsaturated = read_thermal_file(tmp_path / name, COUNTS)[1]
         np.testing.assert_allclose(unsaturated, 0.025 * counts[1] - 100.0, atol=4e-5)
-    spanned = read_thermal_file(tmp_path / "deep.png", BOUNDS).temperature_c
+    spanned = read_thermal_file(tmp_path / "deep.png", BOUNDS)
     np.testing.assert_allclose(spanned, -10 + counts / 65535.0 * 50, atol=4e-6)
     eight = np.array([[1, 2], [3, 255]], np.uint8)
     path = save(tmp_path / "grey.png", np.repeat(eight[..., None], 3, axis=2))
-    np.testing.assert_allclose(read_thermal_file(path, BOUNDS).temperature_c, -10 + eight / 255.0 * 50, atol=4e-6)
+    np.testing.assert_allclose(read_thermal_file(path, BOUNDS), -10 + eight / 255.0 * 50, atol=4e-6)
 
 
 def test_transparent_pixels_are_no_data(tmp_path):
     pixels = np.full((2, 2, 4), 200, np.uint8)
     pixels[0, 1, 3] = 0
     read = read_thermal_file(save(tmp_path / "a.png", pixels), BOUNDS)
-    assert np.isnan(read.temperature_c[0, 1]) and read.report.nan == 1
-    assert np.isfinite(read.temperature_c).sum() == 3
+    assert np.isnan(read[0, 1]) and np.isfinite(read).sum() == 3
 
 
 def test_counts_with_linear_unit_and_saturation(tmp_path):
     counts = np.array([[0, 4000, 65535], [4800, 4801, 4840]], np.uint16)
     read = read_thermal_file(save(tmp_path / "a.tiff", counts), COUNTS)
     expected = np.array([[np.nan, 0.0, np.nan], [20.0, 20.025, 21.0]])
-    np.testing.assert_allclose(read.temperature_c, expected, atol=2e-6)
-    assert (read.report.saturated, read.report.nan, read.report.out_of_range, read.report.pixels) == (2, 0, 0, 6)
+    np.testing.assert_allclose(read, expected, atol=2e-6)
 
 
 def test_float_tiff_is_celsius_unless_linear(tmp_path):
     values = np.array([[1.25, np.nan], [np.inf, 3000.0]], np.float32)
     path = save(tmp_path / "a.tif", values)
     read = read_thermal_file(path, CELSIUS)
-    np.testing.assert_array_equal(read.temperature_c, np.array([[1.25, np.nan], [np.nan, np.nan]], np.float32))
-    assert (read.report.nan, read.report.out_of_range) == (2, 1)
-    np.testing.assert_array_equal(read_thermal_file(path, BOUNDS).temperature_c, read.temperature_c)
+    np.testing.assert_array_equal(read, np.array([[1.25, np.nan], [np.nan, np.nan]], np.float32))
+    np.testing.assert_array_equal(read_thermal_file(path, BOUNDS), read)
     kelvin = save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32))
-    assert read_thermal_file(kelvin, ThermalUnit.linear(1.0, -273.15)).temperature_c == pytest.approx(20.0, abs=1e-4)
+    assert read_thermal_file(kelvin, ThermalUnit.linear(1.0, -273.15)) == pytest.approx(20.0, abs=1e-4)
 
 
 def test_npy_and_csv_are_celsius(tmp_path):
@@ -76,7 +73,7 @@ def test_npy_and_csv_are_celsius(tmp_path):
     (tmp_path / "comma.csv").write_text("20.5,-3.25,\n,7.0\n".replace(",\n,", "\nNaN,"))
     (tmp_path / "semicolon.csv").write_text("20,5;-3,25;\n-;7\n", encoding="utf-8-sig")
     for name in ("a.npy", "comma.csv", "semicolon.csv"):
-        got = read_thermal_file(tmp_path / name, BOUNDS).temperature_c
+        got = read_thermal_file(tmp_path / name, BOUNDS)
         np.testing.assert_array_equal(got, values.astype(np.float32))
 
 
@@ -121,7 +118,7 @@ def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
         entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
         head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
         path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
-    for got in (read_thermal_file(path, BOUNDS).temperature_c, read_thermogram(path).temperature_c):
+    for got in (read_thermal_file(path, BOUNDS), read_thermogram(path).temperature_c):
         np.testing.assert_array_equal(got, values.astype(np.float32))
     assert identify(path, tmp_path).role == "thermal"
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import BuiltMesh, build_mesh
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -37,7 +37,6 @@ def trained(cells: np.ndarray) -> GridSnapshot:
         weight,
         density,
         colour=random.random((*lattice.shape, 3)).astype(np.float32),
-        evidence=RayEvidence(density, np.full(100, 40.0, np.float32)),
         views=looking_at(
             (0.0, 0.0, 0.0), [[4.0, 0.5, 1.0], [-4.0, 0.3, 0.7], [0.2, 4.0, 0.4], [0.1, -4.0, 0.6], [0.3, 0.2, 4.0]]
         ),

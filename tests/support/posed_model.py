@@ -22,20 +22,7 @@ def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float =
         camera_to_world=poses,
         points=on_wall / unit_m,
         point_error_px=np.zeros(points),
-        sighting_frame=np.zeros(0, dtype=np.int64),
-        sighting_point=np.zeros(0, dtype=np.int64),
-        sighting_pixel=np.zeros((0, 2)),
+        seen=(),
     )
-    frames, seen, pixels = [], [], []
-    for index in range(count):
-        at = CAMERA.project(model.in_camera(index, model.points))
-        inside = np.flatnonzero(CAMERA.contains(at))
-        frames.append(np.full(len(inside), index))
-        seen.append(inside)
-        pixels.append(at[inside])
-    return replace(
-        model,
-        sighting_frame=np.concatenate(frames),
-        sighting_point=np.concatenate(seen),
-        sighting_pixel=np.concatenate(pixels),
-    )
+    places = (CAMERA.project(model.in_camera(index, model.points)) for index in range(count))
+    return replace(model, seen=tuple(np.flatnonzero(CAMERA.contains(place)) for place in places))

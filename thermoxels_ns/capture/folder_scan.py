@@ -137,7 +137,7 @@ def identify(path: Path, folder: Path) -> CameraFile:
                 # A picture with one channel of more than 8 bits is no photograph.
                 if image.mode == "F" or image.mode.startswith("I"):
                     check_thermal_size(path, *image.size)
-                    return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
+                    return CameraFile(path, "thermal", read_exif_facts(image)[1])
         facts = read_photograph_facts(path)
         return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
 

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.stage_cache import load_json
+from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions, conditions_text
 from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermogram import ThermogramMetadata, read_thermogram
 
-_LIST = "frames.json"
 _MOST_FOR_DEAD_PIXELS = 60  # at most so many frames are searched for stuck pixels, to save memory
 
 
@@ -53,17 +51,6 @@ class CaptureFrames:
     dead_pixels: int  # number of sensor pixels that are stuck at one value; these are NaN in every frame
     dropped: dict[str, str] = field(default_factory=dict)  # reason by the name of the frame
 
-    @classmethod
-    def load(cls, folder: Path, root: Path) -> CaptureFrames:
-        """Read the list that `read_frames` wrote to `folder`; `root` is the capture folder, and both may have moved."""
-        found = TypeAdapter(CaptureFrames).validate_python(load_json(folder / _LIST))
-        frames = []
-        for frame in found.frames:
-            taken_out = frame.name == frame.thermal_source
-            photograph = folder / "photographs" / frame.photograph if taken_out else root / frame.name
-            frames.append(replace(frame, photograph=photograph, thermal=folder / "thermal" / frame.thermal))
-        return replace(found, frames=tuple(frames))
-
 
 def read_frames(
     pairs: Sequence[Pair],
@@ -81,8 +68,9 @@ def read_frames(
         ThermoxelsError: A file cannot be read and `settings.skip_bad` is off, or no pair is left.
         OSError: A result cannot be written.
     """
-    (folder / "thermal").mkdir(exist_ok=True)
-    (folder / "photographs").mkdir(exist_ok=True)
+    for name in ("thermal", "photographs"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        writable_folder(folder / name)
     frames, dropped, sizes = [], dict[str, str](), []
     for number, pair in enumerate(pairs, start=1):
         try:
@@ -107,10 +95,7 @@ def read_frames(
                 dropped[frame.name] = f"{file} has {why}"
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept)
-    result = CaptureFrames(tuple(kept), usual[0], usual[1], dead, dropped)
-    bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
-    write_json(folder / _LIST, replace(result, frames=bare))
-    return result
+    return CaptureFrames(tuple(kept), usual[0], usual[1], dead, dropped)
 
 
 _Size = tuple[int, int]  # width and height, [pixels]
@@ -146,13 +131,13 @@ def _read(
         thermal=thermal.resolve(),
         thermal_source=pair.thermal,
         metadata=metadata,
-        camera=metadata.camera or facts.exif.camera,
+        camera=metadata.camera or facts.camera,
         focal_px=facts.focal_px,
         orientation=facts.orientation,
         gps=facts.gps or holder.gps,
         gimbal_deg=facts.gimbal_deg or holder.gimbal_deg,
         thermal_focal_px=thermal_focal,
-        masked=thermogram.report.masked,
+        masked=int(np.isnan(thermogram.temperature_c).sum()),
     )
     height, width = thermogram.temperature_c.shape
     return frame, ((facts.width, facts.height), (width, height))

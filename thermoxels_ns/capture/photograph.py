@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image
 
-from thermoxels_ns.radiometry.decoders import ExifFacts, errors_name, read_exif_facts
+from thermoxels_ns.radiometry.decoders import errors_name, read_exif_facts
 
 _EXPECTED = "a photograph that can be decoded"
 _REMEDY = "The file is damaged; copy it from the camera again, or go on without it with --skip-bad True."
@@ -39,7 +39,7 @@ class PhotographFacts:
 
     width: int
     height: int
-    exif: ExifFacts
+    camera: str | None  # maker and model
     taken_at: datetime | None  # as the camera's clock showed it, with fractions of a second where the file has them
     focal_px: float | None
     """Focal length, [pixels], from the lens and the sensor's pixel pitch, else from the equivalent on 35 mm film."""
@@ -54,7 +54,7 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
     """Read a photograph's header; raise `SceneError` if the file is no picture or claims an absurd size."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         width, height = image.size
-        facts = read_exif_facts(image)
+        camera, taken_at = read_exif_facts(image)
         exif = image.getexif()
         tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
         with path.open("rb") as stream:
@@ -63,8 +63,8 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
     return PhotographFacts(
         width=width,
         height=height,
-        exif=facts,
-        taken_at=_with_fraction(facts.taken_at, tags),
+        camera=camera,
+        taken_at=_with_fraction(taken_at, tags),
         focal_px=_focal_px(tags, width, height),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         gps=_gps_fix(gps),

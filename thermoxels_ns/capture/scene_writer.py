@@ -1,4 +1,4 @@
-"""Writes the scene folder that the dataparser reads: photographs, temperatures, tracks of points, transforms.json."""
+"""Writes the scene folder that the dataparser reads: photographs, temperatures, COLMAP's model, transforms.json."""
 
 from __future__ import annotations
 
@@ -14,21 +14,19 @@ from PIL import Image
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
+from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, writable_folder
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS
 from thermoxels_ns.data.scene_scale import SceneScale
-from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
-TRACKS_NAME = "sparse_tracks.npz"
-_FOLDERS = ("images", "thermal")
-SCENE_CONTENT = (JSON_NAME, TRACKS_NAME, *_FOLDERS)
-"""Names of a scene's files and folders in the output folder."""
+_FOLDERS = ("images", "thermal", "colmap")
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
-EVAL_INTERVAL = 8
 
 
 @dataclass(frozen=True)
@@ -37,22 +35,12 @@ class Scene:
 
     frames: Sequence[CaptureFrame]
     model: SfmModel
+    colmap: Path  # folder of COLMAP's model of the same photographs and points
+    moved: FloatArray  # matrix from the coordinates of COLMAP's model to those of `model`, shape (4, 4)
     rig: RigEstimate
     drift: DriftEstimate
     scale: SceneScale | None
     up: Up
-
-
-def scene_names(count: int) -> list[str]:
-    """Return a scene's frame names without suffix; every 8th is for evaluation, but not the first of three or more.
-
-    >>> scene_names(5)[3:]
-    ['frame_eval_00004', 'frame_train_00005']
-    """
-    offset = min(EVAL_INTERVAL // 2, max(count - 2, 0)) if count > 1 else -1
-    digits = max(5, len(str(count)))
-    sets = ["eval" if number % EVAL_INTERVAL == offset else "train" for number in range(count)]
-    return [f"frame_{kind}_{number:0{digits}d}" for number, kind in enumerate(sets, start=1)]
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
@@ -66,16 +54,13 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         entries.append(_write_frame(scene, number, frame, name, new))
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
-    model, names = scene.model, tuple(entry["file_path"] for entry in entries)
-    tracks = SparseTracks(model.points, model.point_error_px, names, model.sighting_frame, model.sighting_point)
-    write_tracks(new / TRACKS_NAME, tracks)
+    shutil.copytree(scene.colmap, new / COLMAP_FOLDERS[0])
     write_json(new / JSON_NAME, _content(scene, entries))
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
         (new / name).rename(output / name)
-    for name in (TRACKS_NAME, JSON_NAME):
-        (new / name).replace(output / name)
+    (new / JSON_NAME).replace(output / JSON_NAME)
     shutil.rmtree(new, ignore_errors=True)
 
 
@@ -109,7 +94,7 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
         "thermal_camera": rig.thermal_camera.entries(),
         "pixel_convention": "the centre of the top left pixel is at (0.5, 0.5)",
         "up": scene.up.direction.tolist(),
-        TRACKS_KEY: TRACKS_NAME,
+        "applied_transform": scene.moved.tolist(),
         "rig": rig.visible_to_thermal.tolist(),
         "rig_info": {
             "meaning": "x_thermal = rig @ x_visible, both in OpenCV camera axes, translation in units of the scene",

@@ -8,8 +8,8 @@ from typing import Literal
 
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
 
-StageName = Literal["pairs", "temperatures", "poses", "scale", "rig", "drift", "scene", "page"]
-"""The stages of a capture in order."""
+StageName = Literal["poses", "rig"]
+"""The stages of a capture whose results are kept, in order."""
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
@@ -18,7 +18,8 @@ class CaptureSettings(RadiometryOptions):
     """All settings of ``thermoxels capture`` except the input and output folders."""
 
     from_stage: StageName | None = None
-    """Run this stage and all later stages again. Without it, only stages whose input or options changed run again."""
+    """Find this again, and the rig after the poses. Without it, these two are found again only if input or options
+    changed; all else, which takes seconds, is done each time."""
     skip_bad: bool = False
     """Leave out and report files that cannot be read, instead of stopping at the first of them."""
     time_limit_s: float = 1.5

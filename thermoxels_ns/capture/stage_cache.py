@@ -1,4 +1,4 @@
-"""Keeps the results of stages, arrays in .npz files and the rest in json, and runs again only what has changed."""
+"""Keeps the results of the stages that take minutes, and runs again only what has changed."""
 
 from __future__ import annotations
 
@@ -6,93 +6,61 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.settings import StageName
+from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.version import __version__
 
-STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-_FORMAT = 4  # number of the results' file format; a higher number makes all earlier results invalid
+_FORMAT = 6  # number of the results' file format; a higher number makes all earlier results invalid
 _KEY_FILE, _DONE_FILE = "key.txt", "done"
-_Record = TypeVar("_Record")
-_EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
 
 
-@dataclass
-class StageCache:
-    """Runs stages in order and keeps what they found in ``.capture/`` of the output folder.
+def run_stage(
+    folder: Path,
+    depends_on: Mapping[str, Any],
+    work: Callable[[Path], None],
+    again: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> str:
+    """Run a stage in a folder of its own, unless its earlier result is still valid; return the key of the result.
 
-    A stage's key is a hash of its name, its options, the files that it reads and the key of the stage before. A
-    finished stage whose key is the same as last time is not run again. A stage that was interrupted and has the same
-    key finds its folder as the interruption left it.
+    The key is a hash of the folder's name and of `depends_on`, which names everything that the result depends on, as
+    values for json. A finished stage whose key is the same as last time is not run, unless `again` asks for it. `work`
+    writes the result into `folder`, which still holds the files of an interrupted run with the same key. Raises
+    `OutputError` if the result cannot be written.
     """
-
-    folder: Path  # the capture's output folder
-    from_stage: StageName | None = None  # run this stage and all later ones, also where nothing has changed
-    say: Callable[[str], None] = lambda _: None  # told one line per stage
-    _previous: str = ""
-
-    def run(
-        self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None], writes: Sequence[Path] = ()
-    ) -> Path:
-        """Run a stage, or find its earlier result still valid; return the folder with the result.
-
-        Call this once per stage, in the order of `STAGES`. `depends_on` names everything that the result depends on
-        besides earlier stages, as values for json. `work` writes the result into the folder passed to it, which may
-        still hold files of an interrupted run with the same key. `writes` are files and folders that the stage writes
-        elsewhere; the stage runs again if one of them is missing.
-
-        Raises:
-            OutputError: The result cannot be written.
-        """
-        content = json.dumps([__version__, _FORMAT, name, self._previous, depends_on], sort_keys=True, default=str)
-        key = hashlib.sha256(content.encode()).hexdigest()
-        self._previous = key
-        folder = self.folder / CACHE_FOLDER / name
-        forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
-        title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
-        stale = forced or _read(folder / _KEY_FILE) != key
-        if not stale and (folder / _DONE_FILE).is_file() and all(path.exists() for path in writes):
-            self.say(f"{title}: as before")
-            return folder
-        remove_file(folder / _DONE_FILE)
-        if stale:
-            # The key is removed first, so that a process killed in between leaves no folder that seems valid.
-            remove_file(folder / _KEY_FILE)
-            if folder.is_dir():
-                shutil.rmtree(folder)
-        writable_folder(folder)
-        with replace_when_done(folder / _KEY_FILE) as temporary:
-            temporary.write_text(key, encoding="utf-8")
-        self.say(title)
-        work(folder)
-        (folder / _DONE_FILE).touch()
-        return folder
+    content = json.dumps([__version__, _FORMAT, folder.name, depends_on], sort_keys=True, default=str)
+    key = hashlib.sha256(content.encode()).hexdigest()
+    stale = again or _read(folder / _KEY_FILE) != key
+    if not stale and (folder / _DONE_FILE).is_file():
+        say(f"{folder.name}: as before")
+        return key
+    remove_file(folder / _DONE_FILE)
+    if stale:
+        # The key is removed first, so that a process killed in between leaves no folder that seems valid.
+        remove_file(folder / _KEY_FILE)
+        if folder.is_dir():
+            shutil.rmtree(folder)
+    writable_folder(folder)
+    with replace_when_done(folder / _KEY_FILE) as temporary:
+        temporary.write_text(key, encoding="utf-8")
+    work(folder)
+    (folder / _DONE_FILE).touch()
+    return key
 
 
-def fingerprint(paths: Sequence[Path], root: Path | None = None) -> list[tuple[str, int, int]]:
-    """Return name (relative to `root`, if given), size [bytes] and time of change [ns] of each file.
-
-    Raises `SceneError` for a missing file.
-    """
-    rows = []
-    for path in paths:
-        if not path.is_file():
-            remedy = "Check the path, or leave it out."
-            raise SceneError(str(path), expected="a file", got="nothing there", remedy=remedy)
-        status = path.stat()
-        name = path if root is None else path.relative_to(root)
-        rows.append((name.as_posix(), status.st_size, status.st_mtime_ns))
-    return rows
+def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:
+    """Return name (relative to `root`), size [bytes] and time of change [ns] of each file."""
+    found = ((path.relative_to(root).as_posix(), path.stat()) for path in paths)
+    return [(name, status.st_size, status.st_mtime_ns) for name, status in found]
 
 
 def prepare_output(folder: Path) -> Path:
@@ -112,36 +80,20 @@ def _read(file: Path) -> str | None:
         return None
 
 
-def save(path: Path, record: Any) -> None:
-    """Write a dataclass (fields: arrays, numbers, texts, tuples, cameras) as .npz, atomically."""
-    values = {each.name: getattr(record, each.name) for each in fields(record)}
-    for name, value in values.items():
-        if isinstance(value, Camera):
-            values[name] = astuple(value)
-    write_npz(path, {name: np.asarray(value) for name, value in values.items()})
+def save_rig(path: Path, rig: RigEstimate) -> None:
+    """Write a rig as .npz, atomically."""
+    write_npz(path, {**vars(rig), "thermal_camera": np.array(astuple(rig.thermal_camera))})
 
 
-def load(path: Path, kind: type[_Record]) -> _Record:
-    """Read a dataclass of type `kind` that `save` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
+def load_rig(path: Path) -> RigEstimate:
+    """Read a rig that `save_rig` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as opened:
-            arrays = {name: opened[name] for name in opened.files}
+            values = {name: opened[name].tolist() if opened[name].ndim < 2 else opened[name] for name in opened.files}
     except (OSError, ValueError, KeyError) as problem:
-        got = str(problem) or type(problem).__name__
-        raise ThermoxelsError(str(path), expected=_EXPECTED, got=got, remedy=_REMEDY) from problem
-    return kind(**{name: _value(arrays[name], hint) for name, hint in get_type_hints(kind).items()})
-
-
-def load_json(path: Path) -> Any:
-    """Read a json file that a stage wrote; raise `ThermoxelsError` if the file is missing or damaged."""
-    return read_json(path, _EXPECTED, _REMEDY)
-
-
-def _value(array: np.ndarray, hint: Any) -> Any:
-    """Return a stored array as the type `hint` of its field: camera, plain value, tuple, or the array itself."""
-    if hint is Camera:
-        width, height, *numbers = array.tolist()
-        return Camera(int(width), int(height), *numbers)
-    if hint in (str, bool, float, int):
-        return hint(array.item())
-    return tuple(array.tolist()) if getattr(hint, "__origin__", None) is tuple else array
+        expected, got = "what an earlier capture wrote", str(problem) or type(problem).__name__
+        raise ThermoxelsError(
+            str(path), expected=expected, got=got, remedy="Run it with --from-stage rig."
+        ) from problem
+    width, height, *numbers = values["thermal_camera"]
+    return RigEstimate(**{**values, "thermal_camera": Camera(int(width), int(height), *numbers)})

@@ -7,36 +7,25 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.capture.folder_scan import files_below, scan_folder
+from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
-from thermoxels_ns.capture.pairs import Pair, PairSearch, search_pairs
+from thermoxels_ns.capture.pairs import Pair, search_pairs
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import read_rig, rig_frames, rig_start
-from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
-from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
+from thermoxels_ns.capture.rig_types import RigEstimate
+from thermoxels_ns.capture.scene_writer import Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.poses import find_poses
+from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, find_poses, read_poses
 from thermoxels_ns.capture.sfm.scale_and_up import scale_from_gps, scale_from_markers, upright
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.capture.stage_cache import (
-    CACHE_FOLDER,
-    StageCache,
-    fingerprint,
-    load,
-    load_json,
-    prepare_output,
-    save,
-)
+from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, fingerprint, load_rig, prepare_output, run_stage, save_rig
 from thermoxels_ns.core.checks import hold_folder, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
-from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 
@@ -69,7 +58,7 @@ def run_capture(
 ) -> CaptureResult:
     """Turn a folder of camera files into a scene, a page and the stages' results in `output`.
 
-    The last stage calls `write_page`, which writes the report. `say` is called with one line of progress at a time.
+    `write_page` writes the report at the end. `say` is called with one line of progress at a time.
 
     Raises:
         ThermoxelsError: A file cannot be read, no pairs or no poses are found, or an option is out of range.
@@ -88,146 +77,113 @@ def run_capture(
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
-            cache = StageCache(folder, settings.from_stage, say)
-            return _Capture(source, folder, settings, cache, say).run(write_page)
+            return _Capture(source, folder, settings, say).run(write_page)
     finally:
         lock.release()
 
 
 @dataclass
 class _Capture:
-    """One capture while it runs; each public method runs one stage, except `run`."""
+    """One capture while it runs. `poses` and `rig`, which take minutes, keep what they find."""
 
     source: Path
     output: Path
     settings: CaptureSettings
-    cache: StageCache
     say: Callable[[str], None]
     dropped: dict[str, str] = field(default_factory=dict)
     """Reason by name, for each file and frame that is left out; the stages add to this dictionary."""
 
     def run(self, write_page: Callable[[CaptureResult], None]) -> CaptureResult:
         """Run all stages in order and return what they found."""
-        pairs = self.pairs()
-        read = self.temperatures(pairs)
-        found = self.poses(read)
+        search = search_pairs(self.source, self.settings, [self.output], self.say)
+        self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
+        self.dropped |= search.unpaired
+        read = self.temperatures(search.pairs)
+        found, key = self.poses(read)
         frames = [frame for frame in read.frames if frame.name in found.frames]
         scale, scale_missing = self.scale(found, frames)
         model, up = upright(found, frames)
-        rig, start = self.rig(model, frames, read, scale)
-        drift = self.drift(model, frames, rig)
-        scene = Scene(frames, model, rig, drift, scale, up)
-        written = [self.output / name for name in SCENE_CONTENT]
-        self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
-        result = CaptureResult(self.source, self.output, pairs, self.dropped, read, scene, start, scale_missing)
-        self.cache.run("page", {}, lambda _: write_page(result), [result.page])
+        rig, start = self.rig(model, frames, read, scale, key)
+        drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
+        self.say(f"drift: {drift.explanation}")
+        moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
+        scene = Scene(frames, model, self.kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)
+        write_scene_folder(scene, self.output, self.say)
+        result = CaptureResult(self.source, self.output, search.pairs, self.dropped, read, scene, start, scale_missing)
+        write_page(result)
         return result
-
-    def pairs(self) -> tuple[Pair, ...]:
-        """Return the pairs of photograph and thermal image that are found in the folder."""
-        settings = self.settings
-        inside = [path for path in files_below(self.source, [self.output]) if path.suffix.lower() in THERMAL_SUFFIXES]
-        depends = {
-            "times": [settings.time_limit_s, settings.clock_offset_s],
-            "files": fingerprint(inside, self.source),
-            "skip_bad": settings.skip_bad,
-        }
-
-        def work(folder: Path) -> None:
-            search = search_pairs(self.source, settings, [self.output], self.say)
-            write_json(folder / "pairs.json", search)
-            self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
-
-        content = load_json(self.cache.run("pairs", depends, work) / "pairs.json")
-        search = TypeAdapter(PairSearch).validate_python(content)
-        self.dropped |= search.unpaired
-        return search.pairs
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
-        settings = self.settings
-        library = [settings.dji_library] if settings.dji_library and settings.dji_library.is_file() else []
-        options = {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)}
-        depends = {"options": options, "library": fingerprint(library), "skip_bad": settings.skip_bad}
-
-        def work(folder: Path) -> None:
-            read = read_frames(pairs, self.source, folder, settings, self.say)
-            width, height = read.thermal_size
-            self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
-
-        read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
+        read = read_frames(pairs, self.source, self.kept, self.settings, self.say)
+        width, height = read.thermal_size
+        self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
         self.dropped |= read.dropped
         return read
 
-    def poses(self, read: CaptureFrames) -> SfmModel:
-        """Return camera, poses and scene points, which are found from the photographs."""
+    @property
+    def kept(self) -> Path:
+        """Folder of what is found before the scene is written."""
+        return self.output / CACHE_FOLDER
+
+    def poses(self, read: CaptureFrames) -> tuple[SfmModel, str]:
+        """Return camera, poses and scene points, which are found from the photographs, and the key of this result."""
         settings = self.settings
         names = ("image_size", "max_features", "lens", "seed", "threads")
-        depends = {"options": {name: getattr(settings, name) for name in names}}
+        depends = {
+            "options": {name: getattr(settings, name) for name in names},
+            "files": fingerprint([self.source / frame.name for frame in read.frames], self.source),
+        }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
             focal = [frame.focal_px for frame in read.frames if frame.focal_px]
             middle = float(np.median(focal)) if focal else None
-            model = find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
-            save(folder / "model.npz", model)
-            self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
+            find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
 
-        model = load(self.cache.run("poses", depends, work) / "model.npz", SfmModel)
+        folder, again = self.kept / "poses", settings.from_stage == "poses"
+        key = run_stage(folder, depends, work, again, self.say)
+        model = read_poses(folder, [frame.name for frame in read.frames], read.photograph_size)
+        self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
         few = "too few matches with the largest group of photographs that fit together"
         self.dropped |= {frame.name: few for frame in read.frames if frame.name not in model.frames}
-        return model
+        return model, key
 
-    def scale(self, found: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
-        """Return the scale, or None and the reason for None."""
-        settings = self.settings
-        depends = {"markers": [settings.marker_side_m, settings.marker_error_m]}
-
-        def work(folder: Path) -> None:
-            scale, missing = self._metric_scale(found, frames)
-            write_json(folder / "scale.json", {"scale": scale, "missing": missing})
-            self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
-
-        content = load_json(self.cache.run("scale", depends, work) / "scale.json")
-        return None if content["scale"] is None else SceneScale(**content["scale"]), content["missing"]
-
-    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
+    def scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return metres per unit from markers, else from GPS; or None and the reason for None."""
         settings = self.settings
         if settings.marker_side_m is not None:
             photographs = {frame.name: frame.photograph for frame in frames}
-            return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
-        return scale_from_gps(model.centres, [frame.gps for frame in frames])
+            scale, missing = scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
+        else:
+            scale, missing = scale_from_gps(model.centres, [frame.gps for frame in frames])
+        self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
+        return scale, missing
 
     def rig(
-        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None
+        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None, poses: str
     ) -> tuple[RigEstimate, RigEstimate]:
-        """Return the rig (found from the images, or given by the user) and the start of its search."""
+        """Return the rig (found from the images, or given by the user) and the start of its search.
+
+        `poses` is the key of the result that `model` came from.
+        """
         settings = self.settings
         angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
         begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
-        depends = {"angle": angle, "rig": fingerprint([settings.rig] if settings.rig else [])}
+        if settings.rig is not None:
+            rig = read_rig(settings.rig, read.thermal_size, metres)
+        else:
+            depends = {
+                "options": {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)},
+                "start": [poses, angle, metres],
+                "files": fingerprint([self.source / frame.thermal_source for frame in read.frames], self.source),
+            }
 
-        def work(folder: Path) -> None:
-            if settings.rig is not None:
-                rig = read_rig(settings.rig, read.thermal_size, metres)
-            else:
-                rig = estimate_rig(
-                    rig_frames(model, frames), model.camera, begin, lambda line: self.say(f"rig: {line}")
-                )
-            save(folder / "rig.npz", rig)
-            self.say(f"rig: {rig.explanation}")
+            def work(folder: Path) -> None:
+                say = lambda line: self.say(f"rig: {line}")  # noqa: E731
+                save_rig(folder / "rig.npz", estimate_rig(rig_frames(model, frames), model.camera, begin, say))
 
-        rig = load(self.cache.run("rig", depends, work) / "rig.npz", RigEstimate)
+            run_stage(self.kept / "rig", depends, work, settings.from_stage is not None, self.say)
+            rig = load_rig(self.kept / "rig" / "rig.npz")
+        self.say(f"rig: {rig.explanation}")
         return rig, begin
-
-    def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
-        """Return how far each thermal image reads too high; all zeros if that does not help at held-out points."""
-
-        def work(folder: Path) -> None:
-            drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
-            save(folder / "drift.npz", drift)
-            self.say(f"drift: {drift.explanation}")
-
-        folder = self.cache.run("drift", {}, work)
-        return load(folder / "drift.npz", DriftEstimate)

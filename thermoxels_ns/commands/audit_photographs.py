@@ -90,7 +90,7 @@ def _cut_out(
     """Cut photograph and thermal image around some points, as JPEG files; None if one is missing or shows no point."""
     if frame.thermal is None:
         return None
-    temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
+    temperature_c = read_thermal_file(frame.thermal, scene.unit)
     height, width = temperature_c.shape
     thermal = frame.thermal_intrinsics or frame.intrinsics.resized(width, height)
     thermal_pose = frame.pose if frame.thermal_pose is None else frame.thermal_pose

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
@@ -26,6 +28,16 @@ class Views:
     focal: FloatArray  # Focal lengths along x and y, shape (c, 2), [pixels]
     centre: FloatArray  # Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]
     size: IntArray  # Image widths and heights, shape (c, 2), [pixels]
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], poses: Sequence[FloatArray]) -> Views:
+        """Return the views of cameras, without their distortion, whose poses are (3, 4) or (4, 4), see above.
+
+        Where a lens distorts, a view may end a little inside or outside the border of the photograph.
+        """
+        pairs = (("fl_x", "fl_y"), ("cx", "cy"), ("width", "height"))
+        parts = (np.array([[getattr(camera, name) for name in pair] for camera in cameras]) for pair in pairs)
+        return cls(np.stack([pose[:3] for pose in poses]), *parts)
 
     def matrices(self) -> FloatArray:
         """Return matrices, (c, 3, 4), from points (x, y, z, 1) to depth * (column, row, 1), with depth > 0 ahead."""
@@ -78,14 +90,10 @@ class RayEvidence:
     half_depth_density: Float32Array
     """For each ray whose opacity exceeds 1/2, the highest density at the centres of the voxels that the ray crosses
     within half a voxel of the point at which half of its weight is spent, shape (rays,), [1 / world unit]."""
-    ends: Float32Array | None = None
+    ends: Float32Array
     """Where these rays end: the points at which half of their weight is spent, in corner indices of the lattice, shape
-    (rays, 3). None: not known."""
-    directions: Float32Array | None = None  # Unit vectors of these rays, shape (rays, 3); None only if `ends` is
-
-    def __post_init__(self) -> None:
-        if (self.ends is None) != (self.directions is None):
-            raise MeshError("ray evidence", expected="ends and directions, or neither", got="one", remedy=_FIELD)
+    (rays, 3)."""
+    directions: Float32Array  # Unit vectors of these rays, shape (rays, 3)
 
 
 @dataclass(frozen=True)

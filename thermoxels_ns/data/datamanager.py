@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -143,12 +142,9 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def training_views(self) -> Views:
         """Return the cameras of the streams that train: the photographs', and thermal cameras where these differ."""
         dataset, streams = self.train_dataset, self.config.streams
-        chosen = []
-        if streams != "thermal" or dataset.thermal_cameras is None:
-            chosen.append(dataset.cameras)
-        if streams != "rgb" and dataset.thermal_cameras is not None:
-            chosen.append(dataset.thermal_cameras)
-        parts = [views_of_cameras(cameras) for cameras in chosen]
+        own = dataset.thermal_cameras is not None
+        kinds = [False] * (streams != "thermal" or not own) + [True] * (streams != "rgb" and own)
+        parts = [dataset.views(thermal) for thermal in kinds]
         return Views(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
 
     def get_train_rays_per_batch(self) -> int:
@@ -160,17 +156,3 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def _rgb_rays(self) -> int:
         sampler = self.train_pixel_sampler
         return self.config.train_num_rays_per_batch if sampler is None else sampler.num_rays_per_batch
-
-
-def views_of_cameras(cameras: Cameras) -> Views:
-    """Return pinhole views without distortion that approximate `cameras`, in the same order.
-
-    Lens distortion is ignored, so a view may end a little inside or outside the border of a distorted photograph.
-    """
-    cameras = cameras.to("cpu")
-
-    def pairs(first: str, second: str, kind: npt.DTypeLike = np.float64) -> npt.NDArray:
-        return np.stack([getattr(cameras, name).numpy().reshape(-1).astype(kind) for name in (first, second)], axis=1)
-
-    pose = cameras.camera_to_worlds.numpy().astype(np.float64)
-    return Views(pose, pairs("fx", "fy"), pairs("cx", "cy"), pairs("width", "height", np.int64))

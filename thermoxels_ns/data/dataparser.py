@@ -27,7 +27,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.tracks import TRACKS_KEY, TrackSource, feature_rays, find_tracks
+from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
 from thermoxels_ns.radiometry.thermal_pixels import VALID_RANGE_C, ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
@@ -80,8 +80,8 @@ class ThermalDataParserConfig(DataParserConfig):
     """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
     tracks: TrackSource = "auto"
     """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
-    auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
-    sparse) whose poses are those of the json. Their points tell where the scene box is, too. off: no tracks."""
+    auto: a COLMAP model in the scene's folder (in colmap or sparse) whose poses are those of the json. Its points tell
+    where the scene box is, too. off: no tracks."""
     refine_poses: PoseSource = "auto"
     """Poses to train with. auto: poses adjusted to features that photographs share (bundle adjustment), if the scene
     has no tracks and the adjusted poses fit better than the json's; else the json's. given: the json's."""
@@ -118,10 +118,9 @@ class ThermalDataParser(DataParser):
 
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
-    and resolution), ``thermal_unit``, ``image_scale`` (1 / downscale_factor),
-    ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
-    ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
-    scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
+    and resolution), ``thermal_unit``, ``image_scale`` (1 / pixels that become one, along a side), ``pixel_size`` (width
+    of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the scene box in input
+    coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
     coordinates), and ``fitted_poses`` of val and test are camera to world in nerfstudio's world, (n, 3, 4); else None.
     """
@@ -166,7 +165,6 @@ class ThermalDataParser(DataParser):
                 "image_scale": factor,
                 "thermal_filenames": [frame.thermal for frame in frames] if scene.file.has_thermal else None,
                 "thermal_cameras": None if shared else thermal_cameras,
-                "thermal_averaged": pixels_averaged if shared else 1,
                 "pixel_size": scene.metadata["pixel_size"] / factor,
                 "feature_rays": scene.feature_rays if training else None,
                 "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,
@@ -202,16 +200,13 @@ class ThermalDataParser(DataParser):
         CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
-        tracks = None if config.tracks == "off" else find_tracks(file, CONSOLE.print)
-        rays = None
-        if tracks is not None:
-            try:
-                rays = feature_rays(tracks, [file.frames[index] for index in split.train])
-            except SceneError as problem:
-                if TRACKS_KEY in file.meta:
-                    raise
-                tracks = None
-                CONSOLE.print(f"Tracks: the COLMAP model is not used (--tracks off leaves it alone): {problem}")
+        tracks = rays = None
+        try:
+            tracks = None if config.tracks == "off" else find_tracks(file, CONSOLE.print)
+            rays = None if tracks is None else feature_rays(tracks, [file.frames[index] for index in split.train])
+        except SceneError as problem:
+            tracks = None
+            CONSOLE.print(f"Tracks: the COLMAP model is not used (--tracks off leaves it alone): {problem}")
         given, fitted = file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
@@ -315,7 +310,7 @@ def survey_thermal_files(
     middles: dict[Path, float] = {}
     low, high = bounds_c or (math.inf, -math.inf)
     for path in paths:
-        temperature_c = read_thermal_file(path, unit).temperature_c
+        temperature_c = read_thermal_file(path, unit)
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():

@@ -18,10 +18,11 @@ from torch import Tensor
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
 from thermoxels_ns.radiometry.decoders import errors_name
-from thermoxels_ns.radiometry.thermal_pixels import PixelReport, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 
 
 class ThermalDataset(InputDataset):
@@ -44,7 +45,7 @@ class ThermalDataset(InputDataset):
         if self.thermal_cameras is None and scale_factor != 1.0:
             # `scale_factor` changes the resolution of the photographs, not of the thermal images.
             self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
-        self._thermal: dict[int, tuple[Tensor, Tensor, PixelReport]] = {}
+        self._thermal: dict[int, tuple[Tensor, Tensor]] = {}
 
     @property
     def shares_camera(self) -> bool:
@@ -64,6 +65,11 @@ class ThermalDataset(InputDataset):
         """Return the pose of the camera that `camera` returns: camera to world, OpenGL axes, shape (3, 4)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         return cameras.camera_to_worlds[image_idx].double().numpy()
+
+    def views(self, thermal: bool = False) -> Views:
+        """Return the photographs' cameras, or with `thermal` those in `thermal_cameras`, as views."""
+        numbers = range(len(self))
+        return Views.of([self.camera(n, thermal) for n in numbers], [self.pose(n, thermal) for n in numbers])
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Return a photograph at the resolution of its camera, shape (h, w, 3), or raise `SceneError`."""
@@ -125,29 +131,28 @@ class ThermalDataset(InputDataset):
 
     def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
         """Return normalised temperatures, 0 where invalid (all, without a thermal image), and a mask of valid ones."""
-        return self._read_thermal(image_idx)[:2]
-
-    def thermal_report(self) -> PixelReport:
-        """Return the counts of masked pixels over all thermal images of the split."""
-        return sum((self._read_thermal(index)[2] for index in range(len(self))), PixelReport())
-
-    def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
         if self.temperature_range is None:
             size = int(self.cameras.height[image_idx]), int(self.cameras.width[image_idx]), 1
-            return torch.zeros(size), torch.zeros(size, dtype=torch.bool), PixelReport()
+            return torch.zeros(size), torch.zeros(size, dtype=torch.bool)
         if image_idx not in self._thermal:
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
-            image = read_thermal_file(path, given["thermal_unit"])
-            valid = np.isfinite(image.temperature_c)
+            temperature_c = read_thermal_file(path, given["thermal_unit"])
+            valid = np.isfinite(temperature_c)
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
-            normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
+            normalised = self.temperature_range.normalise(temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0)
-            if (side := given.get("thermal_averaged", 1)) > 1:
+            side = round(1.0 / given["image_scale"])  # pixels of the photograph that became one, along a side
+            if side > 1 and given["thermal_cameras"] is None:
                 thermal, valid = _averaged(thermal, valid, side)
             thermal = thermal.astype(np.float32)
-            tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
-            self._thermal[image_idx] = (*tensors, image.report)
+            self._thermal[image_idx] = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
         return self._thermal[image_idx]
+
+    def thermal_report(self) -> str:
+        """Return in words how many pixels of the split's thermal images are masked."""
+        valid = [self.get_thermal(index)[1] for index in range(len(self))]
+        pixels, masked = sum(one.numel() for one in valid), sum(int((~one).sum()) for one in valid)
+        return f"{masked} of {pixels} pixels masked ({masked / max(pixels, 1):.2%})"
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:
         """Return a picture at the camera's resolution; a last fraction of a pixel is cut off, as in `Camera.scaled`."""

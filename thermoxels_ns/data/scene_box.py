@@ -130,7 +130,8 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     depth = _depths_in_view(points, frames)
     seen = np.isfinite(depth)
     ahead = np.array([np.median(row[known]) if known.any() else np.nan for row, known in zip(depth, seen)])
-    kept = seen.any(axis=0) & _views(frames).shown_well(points, ahead)
+    views = Views.of([frame.intrinsics for frame in frames], [frame.pose for frame in frames])
+    kept = seen.any(axis=0) & views.shown_well(points, ahead)
     points, shown = points[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
@@ -147,15 +148,6 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     low, high = low - margin, high + margin
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
     return _checked(np.stack([low, high]), "box of the points")
-
-
-def _views(frames: Sequence[Frame]) -> Views:
-    """Return the frames' cameras as pinholes without distortion."""
-    lenses = [frame.intrinsics for frame in frames]
-    focal = np.array([(lens.fl_x, lens.fl_y) for lens in lenses])
-    centre = np.array([(lens.cx, lens.cy) for lens in lenses])
-    size = np.array([(lens.width, lens.height) for lens in lenses])
-    return Views(np.stack([frame.pose[:3] for frame in frames]), focal, centre, size)
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:

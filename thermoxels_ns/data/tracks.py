@@ -1,24 +1,20 @@
-"""Tracks of structure from motion, from their file or from a COLMAP model, and feature rays from them."""
+"""Tracks of structure from motion, from a COLMAP model, and feature rays from them."""
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import remedy_of, write_npz
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, matched_names, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.transforms_json import read_pose
 
-TRACKS_KEY = "tracks_file_path"  # key of transforms.json that names the file of tracks
 FEWEST_VIEWS = 3  # photographs that must see a point: two photographs agree on many wrong points
 MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, [pixels]
 LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
@@ -29,79 +25,25 @@ MOST_OFF = 0.002
 by more than this share of the cameras' distance from their middle."""
 LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
 TrackSource = Literal["auto", "off"]
-_REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
 
 
 @dataclass(frozen=True, eq=False)
 class SparseTracks:
-    """Points and the photographs that see each point: the arrays in a file of tracks, by these names."""
+    """Points and the photographs that see each point."""
 
     points: FloatArray  # shape (n, 3), in the coordinates of the poses
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    frames: tuple[str, ...]  # names of photographs, as ``file_path`` in transforms.json
-    sighting_frame: IntArray  # index into `frames` of each sighting, shape (s,)
-    sighting_point: IntArray  # index into `points` of each sighting, shape (s,)
-    source: str = "tracks"  # name of the file or of the folder of the COLMAP model, which the file does not hold
+    seen: Mapping[str, IntArray]  # indices into `points`, by the photograph's ``file_path`` in transforms.json
+    source: str = "tracks"  # folder of the COLMAP model
 
     def well_seen(self) -> FloatArray:
         """Return the points (m, 3) that enough photographs see with a small enough error (see `feature_rays`)."""
-        views = np.bincount(self.sighting_point, minlength=len(self.points))
+        views = np.bincount(np.concatenate([*self.seen.values()]), minlength=len(self.points))
         return self.points[(views >= FEWEST_VIEWS) & (self.point_error_px <= MOST_ERROR_PX)]
 
 
-def write_tracks(path: Path, tracks: SparseTracks) -> None:
-    """Write tracks to a compressed .npz file, whole or not at all; raises `OutputError` if it cannot be written."""
-    arrays = {
-        "points": tracks.points,
-        "point_error_px": tracks.point_error_px.astype(np.float32),
-        "frames": np.array(tracks.frames, dtype=np.str_),
-        "sighting_frame": tracks.sighting_frame.astype(np.int32),
-        "sighting_point": tracks.sighting_point.astype(np.int32),
-    }
-    write_npz(path, arrays)
-
-
-def read_tracks(path: Path) -> SparseTracks:
-    """Read and check a file of tracks, or raise `SceneError` if it is missing, of another kind or inconsistent."""
-    names = ("points", "point_error_px", "frames", "sighting_frame", "sighting_point")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            points, error, frames, frame, point = (file[name] for name in names)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
-        expected = f"an .npz with {', '.join(names)}"
-        raise SceneError(path.name, expected=expected, got=problem, remedy=remedy_of(problem, _REMEDY)) from problem
-    kinds = "".join(array.dtype.kind for array in (points, error, frames, frame, point))
-    good = kinds == "ffUii" and (points.ndim, frames.ndim, frame.ndim) == (2, 1, 1)
-    good = good and points.shape[1] == 3 and error.shape == points.shape[:1] and frame.shape == point.shape
-    good = good and all(
-        ((one >= 0) & (one < count)).all() for one, count in ((frame, len(frames)), (point, len(points)))
-    )
-    if not good:
-        arrays = (points, error, frames, frame, point)
-        shapes = ", ".join(f"{name} {array.dtype}{array.shape}" for name, array in zip(names, arrays))
-        raise SceneError(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
-    places = points.astype(np.float64), error.astype(np.float64)
-    return SparseTracks(*places, tuple(map(str, frames)), frame.astype(np.int64), point.astype(np.int64), path.name)
-
-
 def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseTracks | None:
-    """Return the tracks of a scene in input coordinates; None if it has none.
-
-    They are in the file that the json names, else in the COLMAP model in the scene's folder (`read_colmap_tracks`). If
-    the model cannot be used, `say` receives the reason. Raises `SceneError` if the file cannot be used.
-    """
-    if TRACKS_KEY in scene.meta:
-        return read_tracks(scene.folder / str(scene.meta[TRACKS_KEY]))
-    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
-    try:
-        return None if folder is None else read_colmap_tracks(scene, folder, say)
-    except SceneError as problem:
-        say(f"Tracks: the COLMAP model in {folder} is not used (--tracks off leaves it alone): {problem}")
-        return None
-
-
-def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]) -> SparseTracks:
-    """Return the tracks of the COLMAP model in a folder of a scene, in input coordinates.
+    """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
 
     Photographs are matched by name. The json's poses must be those of the model, moved by the json's
     ``applied_transform`` if it has one. Two poses of a photograph agree if they differ by less than `MOST_OFF`.
@@ -110,6 +52,9 @@ def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]
     Raises:
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
     """
+    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
+    if folder is None:
+        return None
     cameras, images, points = read_model(scene.folder / folder)
     pairs = matched_names([image.name for image in images.values()], [frame.name for frame in scene.frames])
     if not pairs:
@@ -118,12 +63,6 @@ def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]
         raise SceneError(f"it has no photograph of this scene, or several of one name ({names})")
     listed = list(images.values())
     found, frames = [listed[image] for image, _ in pairs], [scene.frames[frame] for _, frame in pairs]
-    number = {image.id: place for place, image in enumerate(found)}
-    # A track may hold two features of one photograph.
-    seen = [(place, number[i]) for place, one in enumerate(points.values()) for i in {*one.image_ids} & number.keys()]
-    if not seen:
-        raise SceneError("it has no points that photographs of this scene see")
-    point, frame = np.array(sorted(seen), dtype=np.int64).T
     widths = [f.intrinsics.width / max(cameras[image.camera_id].width, 1) for f, image in zip(frames, found)]
     error_px = np.array([float(one.error) for one in points.values()])
     # COLMAP writes -1 for an error that it did not compute; such a point counts as the worst that is used.
@@ -148,8 +87,13 @@ def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]
         strays = ", ".join(one.name for one, good in zip(frames, agree) if not good)
         say(f"Tracks: other poses than COLMAP's, left out: {strays}")
     moved = np.array([one.xyz for one in points.values()]) @ world[:3, :3].T + world[:3, 3]
-    kept, names = agree[frame], tuple(one.name for one in frames)
-    return SparseTracks(moved, error_px, names, frame[kept], point[kept], folder)
+    row = {point: number for number, point in enumerate(points)}
+    # A photograph may show a point by two features.
+    shown = [sorted({row[point] for point in image.point3D_ids.tolist() if point in row}) for image in found]
+    seen = {f.name: np.array(some, dtype=np.int64) for f, some, good in zip(frames, shown, agree) if good}
+    if not any(map(len, seen.values())):
+        raise SceneError("it has no points that photographs of this scene see")
+    return SparseTracks(moved, error_px, seen, folder)
 
 
 def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
@@ -163,24 +107,20 @@ def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
     Raises:
         SceneError: No frame is in `tracks`, or `tracks` are of other poses.
     """
-    place = {frame.name: number for number, frame in enumerate(frames)}
-    number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
-    if not (number >= 0).any():
-        got = f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}"
-        raise SceneError(tracks.source, expected="photographs of this scene", got=got, remedy=_REMEDY)
+    seen = [tracks.seen.get(one.name, np.zeros(0, dtype=np.int64)) for one in frames]
+    point, frame = np.concatenate(seen), np.repeat(np.arange(len(frames)), [len(some) for some in seen])
+    if not len(point):
+        raise SceneError("it has no photograph that trains")
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
-    used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
-    # Sorted by point, each pair once: a photograph that sees a point twice counts once.
-    pairs = np.unique(tracks.sighting_point[used] * len(frames) + number[tracks.sighting_frame[used]])
-    point, frame = np.divmod(pairs, len(frames))
+    order = np.argsort(point, kind="stable")
+    order = order[known[point[order]]]
+    point, frame = point[order], frame[order]
     poses = np.stack([one.pose for one in frames])
     focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
     line = tracks.points[point] - poses[frame, :3, 3]
     behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
     if behind.sum() > MOST_BEHIND * len(behind):
-        expected = "points in front of the photographs that see them"
-        got = f"{behind.mean():.0%} of the sightings behind: the poses are others"
-        raise SceneError(tracks.source, expected=expected, got=got, remedy=_REMEDY)
+        raise SceneError(f"{behind.mean():.0%} of its points lie behind the photographs that see them")
     frame, point, line = frame[~behind], point[~behind], line[~behind]
     length = np.linalg.norm(line, axis=1)
     angle = _parallax(line / np.maximum(length, 1e-300)[:, None], point, len(tracks.points))

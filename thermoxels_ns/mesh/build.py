@@ -14,7 +14,7 @@ from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions, with_
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
 from thermoxels_ns.mesh.solid.level_set import level_of
-from thermoxels_ns.mesh.solid.morphology import face_connected, grow
+from thermoxels_ns.mesh.solid.morphology import connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
@@ -139,7 +139,7 @@ def build_mesh(
 
 def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
     """Return the solid voxels of all bodies of voxels, joined by faces, in which one of the points (n, 3) lies."""
-    body = face_connected(cells)
+    body = connected(cells, connectivity=1)
     chosen = np.zeros(int(body.max()) + 1, dtype=bool)
     chosen[body[tuple(np.floor(points).astype(np.int64).T)]] = True
     chosen[0] = False

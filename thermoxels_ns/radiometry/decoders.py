@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -78,29 +77,15 @@ def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
         return list(getattr(image, "applist", []))
 
 
-@dataclass(frozen=True)
-class ExifFacts:
-    """Camera and time from EXIF tags; a field is None if its tag is missing."""
+def read_exif_facts(image: Image.Image) -> tuple[str | None, datetime | None]:
+    """Return maker and model in one text, and the time as the camera's clock showed it, from an opened image's EXIF.
 
-    make: str | None = None
-    model: str | None = None
-    taken_at: datetime | None = None  # without a time zone, as the camera's clock showed it
-
-    @property
-    def camera(self) -> str | None:
-        """Maker and model in one text; None if both are missing."""
-        return " ".join(word for word in (self.make, self.model) if word) or None
-
-
-def read_exif_facts(image: Image.Image) -> ExifFacts:
-    """Return camera and time from the EXIF tags of an opened image, without decoding the pixels."""
+    Each is None if its tags are missing. Pixels are not decoded.
+    """
     exif = image.getexif()
     tags: Mapping[int, Any] = {**exif, **exif.get_ifd(_EXIF)}
-    return ExifFacts(
-        _text(tags.get(_MAKE)),
-        _text(tags.get(_MODEL)),
-        _time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT)),
-    )
+    camera = " ".join(word for tag in (_MAKE, _MODEL) if (word := _text(tags.get(tag))))
+    return camera or None, _time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT))
 
 
 def _text(value: object) -> str | None:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array
+from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, app_segments, check_thermal_size, errors_name
@@ -84,17 +84,12 @@ class FlirImage:
     picture_in_picture: PictureInPicture | None  # factory alignment; None if the file has none
     visible: bytes | None  # bytes of the photograph's JPEG or PNG; None if absent or in another format
 
-    @property
-    def outside_calibration(self) -> BoolArray:
-        """Mask of the pixels with counts outside the camera's calibrated range, shape (height, width)."""
-        low, high = self.camera.raw_range
-        return (self.counts < low) | (self.counts > high)
-
     def temperature_c(self, conditions: Conditions | None = None) -> Float32Array:
-        """Return degrees C, (height, width), under `conditions` or else the camera's; NaN if `outside_calibration`."""
+        """Return degrees C, (height, width), under `conditions` or else the camera's; NaN outside the calibration."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
-        temperature_c = model.temperature_c(self.counts)
-        return np.where(self.outside_calibration, np.nan, temperature_c).astype(np.float32)
+        low, high = self.camera.raw_range
+        known = (self.counts >= low) & (self.counts <= high)
+        return np.where(known, model.temperature_c(self.counts), np.nan).astype(np.float32)
 
 
 def is_flir_jpeg(path: Path) -> bool:

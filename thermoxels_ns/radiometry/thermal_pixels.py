@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -99,38 +99,6 @@ class ThermalUnit:
         return cls("celsius")
 
 
-@dataclass(frozen=True)
-class PixelReport:
-    """Numbers of masked pixels by reason; reports add up with ``+``."""
-
-    pixels: int = 0  # all pixels read
-    nan: int = 0  # pixels that are not a number, infinite or fully transparent in the file
-    saturated: int = 0
-    """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside FLIR's calibrated range."""
-    out_of_range: int = 0  # pixels outside `VALID_RANGE_C`
-
-    def __add__(self, other: PixelReport) -> PixelReport:
-        return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
-
-    @property
-    def masked(self) -> int:
-        """Number of all pixels without a usable temperature."""
-        return self.nan + self.saturated + self.out_of_range
-
-    def __str__(self) -> str:
-        share = 100.0 * self.masked / max(self.pixels, 1)
-        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range"
-        return f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {kinds}"
-
-
-@dataclass(frozen=True)
-class ThermalImage:
-    """Temperatures of one thermal file, and how many pixels were masked."""
-
-    temperature_c: Float32Array  # shape (height, width), [degrees Celsius], NaN where masked
-    report: PixelReport
-
-
 def detect_format(path: Path) -> ThermalFormat:
     """Return the format of a file by its content; raise `ThermalFileError` if it is missing, empty or of no format."""
     if not path.is_file():
@@ -151,8 +119,10 @@ def detect_format(path: Path) -> ThermalFormat:
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
-def read_thermal_file(path: Path, unit: ThermalUnit) -> ThermalImage:
-    """Read the temperatures of a file whose `unit` is known; its content tells the format, not its name.
+def read_thermal_file(path: Path, unit: ThermalUnit) -> Float32Array:
+    """Return the temperatures (height, width) [degrees C] of a file whose `unit` is known, NaN where not measured.
+
+    The content tells the format, not the name.
 
     A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
     bounds or linear for PNG and JPEG, linear for TIFF and NPY. A floating-point TIFF is in degrees Celsius unless the
@@ -199,20 +169,16 @@ def read_thermal_file(path: Path, unit: ThermalUnit) -> ThermalImage:
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
         celsius[no_data] = np.nan
-    return masked_image(celsius, saturated & np.isfinite(celsius))
+    return masked_image(celsius, saturated)
 
 
-def masked_image(temperature_c: npt.NDArray[np.floating], saturated: BoolArray | None = None) -> ThermalImage:
-    """Set temperatures (height, width) [degrees C] to NaN if not finite, saturated or out of range, and count these."""
-    if saturated is None:
-        saturated = np.zeros(temperature_c.shape, dtype=bool)
-    nan = ~np.isfinite(temperature_c) & ~saturated
+def masked_image(temperature_c: npt.NDArray[np.floating], saturated: BoolArray | None = None) -> Float32Array:
+    """Return temperatures (height, width) [degrees C], NaN where not finite, saturated or outside `VALID_RANGE_C`."""
     with np.errstate(invalid="ignore"):
-        inside = (temperature_c >= VALID_RANGE_C[0]) & (temperature_c <= VALID_RANGE_C[1])
-    outside = ~inside & ~nan & ~saturated
-    masked = np.where(nan | saturated | outside, np.nan, temperature_c).astype(np.float32)
-    report = PixelReport(masked.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))
-    return ThermalImage(masked, report)
+        good = (temperature_c >= VALID_RANGE_C[0]) & (temperature_c <= VALID_RANGE_C[1])
+    if saturated is not None:
+        good &= ~saturated
+    return np.where(good, temperature_c, np.nan).astype(np.float32)
 
 
 def _read_npy(path: Path) -> npt.NDArray[Any]:

@@ -9,7 +9,7 @@ from PIL import Image
 
 from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.radiometry.decoders import ExifFacts, app_segments, check_thermal_size, errors_name, read_exif_facts
+from thermoxels_ns.radiometry.decoders import app_segments, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import read_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
 from thermoxels_ns.radiometry.measurement_model import (
@@ -19,9 +19,7 @@ from thermoxels_ns.radiometry.measurement_model import (
     corrected_temperature_c,
 )
 from thermoxels_ns.radiometry.thermal_pixels import (
-    PixelReport,
     ThermalFormat,
-    ThermalImage,
     ThermalUnit,
     detect_format,
     masked_image,
@@ -40,16 +38,16 @@ COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
 FLIR's two gains was used, so the user must say."""
 
 
-def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
-    """Return the preset (`COUNT_SCALES`) that the maker and model in a file determine; None if the user must choose.
+def recognised_camera(camera: str | None) -> CameraName | None:
+    """Return the preset (`COUNT_SCALES`) that maker and model in a file determine; None if the user must choose.
 
-    >>> recognised_camera("Workswell", "WIRIS Pro"), recognised_camera("FLIR", "Duo Pro R")
+    >>> recognised_camera("Workswell s.r.o. WIRIS Pro"), recognised_camera("FLIR Duo Pro R")
     ('workswell', None)
     """
-    make, model = (make or "").strip().lower(), (model or "").strip().lower()
-    if make.startswith("workswell") and model.startswith("wiris pro"):
+    named = (camera or "").lower()
+    if named.startswith("workswell") and "wiris pro" in named:
         return "workswell"
-    return "sensefly" if make.startswith("sensefly") else None
+    return "sensefly" if named.startswith("sensefly") else None
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,6 @@ class Thermogram:
 
     temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where masked
     metadata: ThermogramMetadata
-    report: PixelReport  # numbers of masked pixels by reason
 
 
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
@@ -98,14 +95,14 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         if found == "FLIR R-JPEG":
             flir = read_flir_jpeg(path)
             conditions = options.applied_to(flir.camera.conditions)
-            image = masked_image(flir.temperature_c(conditions), saturated=flir.outside_calibration)
+            temperature_c = masked_image(flir.temperature_c(conditions))
             camera, angle = flir.camera.model, flir.camera.field_of_view_deg
             metadata = ThermogramMetadata(found, camera, angle, conditions, flir.picture_in_picture)
         elif found == "DJI R-JPEG":
             temperature_c, conditions = read_dji_rjpeg(path, options)
-            image = masked_image(temperature_c)
+            temperature_c = masked_image(temperature_c)
             with Image.open(path) as opened:
-                metadata = ThermogramMetadata(found, read_exif_facts(opened).camera, conditions=conditions)
+                metadata = ThermogramMetadata(found, read_exif_facts(opened)[0], conditions=conditions)
         elif found == "JPEG":
             app_segments(path, whole=True)  # says so if the file is cut off
             expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
@@ -113,40 +110,40 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
         else:
-            image, metadata = _read_stored(path, found, options)
-    return Thermogram(image.temperature_c, metadata, image.report)
+            temperature_c, metadata = _read_stored(path, found, options)
+    return Thermogram(temperature_c, metadata)
 
 
 def _read_stored(
     path: Path, found: ThermalFormat, options: RadiometryOptions
-) -> tuple[ThermalImage, ThermogramMetadata]:
+) -> tuple[Float32Array, ThermogramMetadata]:
     """Read a file of apparent temperatures or of counts linear in temperature; correct for the user's conditions."""
-    unit, exif, picture = _given_unit(options), ExifFacts(), found in ("TIFF", "PNG")
+    unit, camera, picture = _given_unit(options), None, found in ("TIFF", "PNG")
     if picture and size_of_double_tiff(path) is None:
         with Image.open(path) as image:
             check_thermal_size(path, *image.size)
-            mode, exif = image.mode, read_exif_facts(image)
+            mode, (camera, _) = image.mode, read_exif_facts(image)
         if mode != "F" and not mode.startswith("I"):
             expected = "one channel of 16-bit counts or of floats, [degrees C]"
             got = f"image mode {mode}: a picture for the eye, whose shades are no temperatures"
             remedy = "Export the radiometric TIFF from the camera or its program."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
-        camera = recognised_camera(exif.make, exif.model)
-        if mode != "F" and unit is None and camera is None:
-            known = ", ".join(f"{name} ({cameras})" for name, (_, cameras) in COUNT_SCALES.items())
-            remedy = f"Pass --camera with one of {known}; or --celsius-per-count and --celsius-offset."
-            got = f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things"
-            raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
-        if mode != "F" and unit is None and camera is not None:
-            unit = COUNT_SCALES[camera][0]
+        if mode != "F" and unit is None:
+            preset = recognised_camera(camera)
+            if preset is None:
+                known = ", ".join(f"{name} ({cameras})" for name, (_, cameras) in COUNT_SCALES.items())
+                remedy = f"Pass --camera with one of {known}; or --celsius-per-count and --celsius-offset."
+                got = f"counts of {camera or 'an unnamed camera'}, which may mean several things"
+                raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
+            unit = COUNT_SCALES[preset][0]
     unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
-    image = read_thermal_file(path, unit)
+    temperature_c = read_thermal_file(path, unit)
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if picture and unit.kind == "linear" else None
-    metadata = ThermogramMetadata(found, exif.camera, conditions=conditions, celsius_per_count=per_count)
+    metadata = ThermogramMetadata(found, camera, conditions=conditions, celsius_per_count=per_count)
     if conditions != Conditions():
-        image = masked_image(corrected_temperature_c(image.temperature_c, conditions))
-    return image, metadata
+        temperature_c = masked_image(corrected_temperature_c(temperature_c, conditions))
+    return temperature_c, metadata
 
 
 def _given_unit(options: RadiometryOptions) -> ThermalUnit | None:

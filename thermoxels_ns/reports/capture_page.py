@@ -13,7 +13,7 @@ from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
-from thermoxels_ns.capture.scene_writer import scene_names
+from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
@@ -109,11 +109,12 @@ def capture_page(
     `temperatures_c` is a sample of corrected temperatures; `masked_share` is the share of masked thermal pixels.
     """
     scene, rig = result.scene, result.scene.rig
-    errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
+    error_px, known_c = scene.model.point_error_px, temperatures_c[np.isfinite(temperatures_c)]
+    errors = error_px[np.concatenate(scene.model.seen)]
     off = {**rig.standard_errors, "focal": rig.standard_errors["log_focal"] * rig.thermal_camera.fl_x}
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
-        own = errors[scene.model.sighting_frame == index] if errors.size else errors
+        own = error_px[scene.model.seen[index]]
         frames.append((name, frame, len(own), f"{np.median(own):.2f}" if len(own) else "-"))
     return build_page(
         "capture.html.j2",

@@ -19,7 +19,6 @@ from torch.nn import Parameter
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.data.datamanager import views_of_cameras
 from thermoxels_ns.field.refine import RowChange, prune, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
@@ -70,7 +69,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
-        hidden = hardly_shown(lattice.index_to_world(centres), views_of_cameras(dataset.cameras))
+        hidden = hardly_shown(lattice.index_to_world(centres), dataset.views())
         air |= hidden & ~hidden.all()
         if 0 < air.sum() < len(air):
             CONSOLE.log(

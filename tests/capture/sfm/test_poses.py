@@ -4,24 +4,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+from tests.support.camera_card import write_pairs
 from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
-from tests.support.textured_room import write_card
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap
-from thermoxels_ns.capture.sfm.poses import image_pairs
+from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, image_pairs, read_poses
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
-
-SETTINGS = CaptureSettings(max_features=500)
-COUNT = 6
-
-
-@pytest.fixture(scope="module")
-def card(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("card")
-    truth = write_card(folder, COUNT)
-    photographs = {path.name.split("-")[0]: path for path in sorted(folder.glob("*.jpg"))}
-    return photographs, truth
+from thermoxels_ns.commands.capture import capture_folder
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 
 def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():
@@ -32,6 +22,21 @@ def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():
     assert len(np.unique(many, axis=0)) == len(many)
     assert {(n, n + 1) for n in range(499)} <= set(map(tuple, many.tolist()))
     assert (0, 499) in set(map(tuple, many.tolist()))  # a path that returns to its start is closed
+
+
+def test_a_mapping_that_fails_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("no model")
+
+    write_pairs(tmp_path / "card")
+    said: list[str] = []
+    monkeypatch.setattr(pycolmap, "incremental_mapping", fail)
+    with pytest.raises(ThermoxelsError, match=r"COLMAP: .* got no model.*--from-stage poses"):
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
+    assert said[-1].startswith("matches: 3 of 3")
+    monkeypatch.undo()
+    with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the mapping
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
 
 
 def test_a_slanted_plane_has_its_own_depth_and_not_that_of_its_nearest_points() -> None:
@@ -58,16 +63,15 @@ MODEL = ring_model(5, points=60)
 
 
 def test_a_colmap_model_comes_in_with_its_points_at_the_photographs_own_size(tmp_path):
-    files = {f"{name}-visible.jpg": name for name in MODEL.frames}
-    write_colmap_model(tmp_path, list(files), MODEL.camera_to_world, CAMERA, MODEL.points, text=True)
-    found = model_of_colmap(pycolmap.Reconstruction(str(tmp_path)), files, (CAMERA.width, CAMERA.height))
+    write_colmap_model(tmp_path / MODEL_FOLDER, list("abcde"), MODEL.camera_to_world, CAMERA, MODEL.points)
+    found = read_poses(tmp_path, MODEL.frames, (CAMERA.width, CAMERA.height))
+    assert found.frames == MODEL.frames
     assert found.camera_to_world == pytest.approx(MODEL.camera_to_world, abs=1e-9)
     assert found.camera == CAMERA
     assert len(found.points) == len(MODEL.points)
-    assert found.sighting_error_px().max() < 1e-6
-    assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
+    assert found.points == pytest.approx(MODEL.points, abs=1e-9)
+    assert [len(seen) for seen in found.seen] == len(MODEL.frames) * [len(MODEL.points)]
     assert found.point_error_px == pytest.approx(0.5)
-    large = model_of_colmap(pycolmap.Reconstruction(str(tmp_path)), files, (1280, 960))
+    large = read_poses(tmp_path, MODEL.frames, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
-    assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)

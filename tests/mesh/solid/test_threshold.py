@@ -32,16 +32,16 @@ def field(
 ) -> GridSnapshot:
     """A field with the given voxels, and rays that meet the given densities where they end.
 
-    `ends` counts the rays that end in the middle of each voxel, downwards; None: not known.
+    `ends` counts the rays that end in the middle of each voxel, downwards; None: all end outside of the lattice.
     """
     lattice = Lattice((0.0, 0.0, 0.0), VOXEL, tuple(n + 1 for n in voxel_density.shape))  # type: ignore[arg-type]
-    weight = np.ones_like(voxel_density) if weight is None else weight
+    weight = np.zeros_like(voxel_density) if weight is None else weight
     zero = np.zeros(lattice.shape, dtype=np.float32)
-    of_rays: list[np.ndarray] = []
+    middles = np.full((len(met), 3), -9.0)
     if ends is not None:
         counts = ends.astype(np.int64).ravel()
         middles = np.stack(np.unravel_index(np.repeat(np.arange(counts.size), counts), ends.shape), axis=1) + 0.5
-        of_rays = [middles.astype(np.float32), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(middles), 1))]
+    of_rays = [middles.astype(np.float32), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(middles), 1))]
     evidence = RayEvidence(weight.astype(np.float32), met.astype(np.float32), *of_rays)
     density = voxel_density.astype(np.float32)
     return GridSnapshot(lattice, zero, zero, zero, voxel_density=density, evidence=evidence)
@@ -93,14 +93,14 @@ def test_voxels_in_which_no_ray_ends_are_solid_only_if_they_are_opaque():
 
 
 def test_a_few_dense_voxels_behind_a_surface_do_not_widen_the_body():
-    """Without the ends that are counted the body would reach down to them."""
+    """Without the weight that rays spent there the body would reach down to them."""
     density, weight, ends = leak()
     density[:, :, 3] = 0.0
     density[2, 2, 3] = density[7, 7, 3] = 2.5
     whole = field(density, MET, weight, ends)
     assert whole.evidence is not None
     assert not select_solid(whole, SolidSelection(region="all")).cells[:, :, :5].any()
-    blind = replace(whole, evidence=replace(whole.evidence, ends=None, directions=None))
+    blind = replace(whole, evidence=replace(whole.evidence, voxel_weight=np.zeros_like(whole.evidence.voxel_weight)))
     assert select_solid(blind, SolidSelection(region="all")).cells[:, :, 3].any()
 
 

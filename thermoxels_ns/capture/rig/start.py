@@ -33,8 +33,7 @@ def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
     for index, frame in enumerate(frames):
-        seen, _ = model.seen_by(index)
-        seen = seen[good[seen]]
+        seen = model.seen[index][good[model.seen[index]]]
         points = model.in_camera(index, model.points[seen])
         result.append(RigFrame(frame.photograph, frame.thermal, points, seen))
     return result

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import PARAMETERS
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.data.colmap_model import PARAMETERS, lens_entries
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
 _DATABASE, _IMAGES = "features.db", "images"
+MODEL_FOLDER = "model"  # folder, in that of the stage, of COLMAP's model
+EVAL_INTERVAL = 8
 EXHAUSTIVE_UP_TO = 80  # all pairs are compared up to this number of photographs; time grows with its square
 _NEIGHBOURS = 8
 """Beyond it, each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
@@ -32,6 +36,7 @@ _ANCHORS = 40
 that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
+_FATAL_ONLY = 3
 
 
 def find_poses(
@@ -41,47 +46,60 @@ def find_poses(
     settings: CaptureSettings,
     focal_px: float | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> SfmModel:
+) -> None:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
     `photographs` maps frame names to files of `size` (width, height), in the order they were taken; `focal_px` is their
-    stated focal length. Results of an interrupted run in `folder` are reused. Only the largest set of photographs that
-    fit is kept.
+    stated focal length. Results of an interrupted run in `folder` are reused. COLMAP's model of the largest set of
+    photographs that fit is written to `MODEL_FOLDER` of `folder`, with the names that photographs have in the scene.
+
+    On some errors, such as a thread that cannot write, COLMAP says why and aborts; the next run goes on from there.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
+        ThermoxelsError: COLMAP raised an error.
     """
+    import pycolmap
+
     if len(photographs) < MIN_FRAMES:
         raise _too_few(len(photographs), "photographs of one size")
-    frame_of_image, small = _reduced(photographs, folder / _IMAGES, size, settings.image_size)
+    names, small = _reduced(photographs, folder / _IMAGES, size, settings.image_size)
     params = ""
     if focal_px is not None:
         start = {"cx": small[0] / 2.0, "cy": small[1] / 2.0}
         start |= dict.fromkeys(("f", "fl_x", "fl_y"), focal_px * small[0] / size[0])
         params = ",".join(str(start.get(name, 0.0)) for name in PARAMETERS[settings.lens])
-    run_in_process(_find_and_match, (folder, list(frame_of_image), params, settings), say)
-    model = run_in_process(_map, (folder, frame_of_image, size, settings.seed), say)
-    if model is None or len(model.frames) < MIN_FRAMES:
-        raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
-    return model
+    log_of_colmap: Any = pycolmap.logging
+    log_of_colmap.minloglevel = _FATAL_ONLY
+    try:
+        with threadpool_limits(1, "blas"):  # pycolmap has its own BLAS, whose sums depend on its number of threads
+            _find_and_match(folder, names, params, settings, say)
+            posed = _map(folder, len(names), settings.seed, say)
+    except OSError:
+        raise
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError and others
+        remedy = "Check free space; if that does not help, begin anew with --from-stage poses."
+        raise ThermoxelsError("COLMAP", expected="to finish its work", got=problem, remedy=remedy) from problem
+    if posed < MIN_FRAMES:
+        raise _too_few(posed, "photographs that fit together")
 
 
 def _reduced(
     photographs: Mapping[str, Path], images: Path, size: tuple[int, int], longest: int
-) -> tuple[dict[str, str], tuple[int, int]]:
+) -> tuple[list[str], tuple[int, int]]:
     """Write photographs for COLMAP, at most `longest` pixels wide and high, into the folder `images`.
 
-    The files have no EXIF, by which COLMAP would turn them. Returns the frames' names by the files', in the order in
-    which the photographs were taken, and the files' width and height [pixels].
+    The files have no EXIF, by which COLMAP would turn them. Returns their names, in the order in which the photographs
+    were taken, and their width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
     images.mkdir(exist_ok=True)
     digits = max(4, len(str(len(photographs))))
-    files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
-    for file, name in files.items():
+    files = [f"{index:0{digits}d}.jpg" for index in range(len(photographs))]
+    for file, photograph in zip(files, photographs.values()):
         if not (images / file).is_file():
-            picture = open_photograph(photographs[name])
+            picture = open_photograph(photograph)
             if small != size:
                 much = max(small) < 0.5 * max(size)
                 picture = picture.resize(small, Image.Resampling.BOX if much else Image.Resampling.LANCZOS)
@@ -98,10 +116,8 @@ def _too_few(got: int, what: str) -> SceneError:
     return SceneError("poses", expected=f"at least {MIN_FRAMES} {what}", got=got, remedy=remedy)
 
 
-def _map(
-    folder: Path, frame_of_image: Mapping[str, str], size: tuple[int, int], seed: int, say: Callable[[str], None]
-) -> SfmModel | None:
-    """Return the model of the largest group of photographs that fit together, or None."""
+def _map(folder: Path, count: int, seed: int, say: Callable[[str], None]) -> int:
+    """Write the model of the largest group of photographs that fit together; return their number, 0 without a group."""
     import pycolmap
 
     found = 2  # COLMAP does not call next_image for the first pair
@@ -110,7 +126,6 @@ def _map(
         nonlocal found
         found += 1
         if found % _SAID_EVERY == 0:
-            count = len(frame_of_image)
             say(f"poses: {min(found, count)} of {count} photographs")
 
     pycolmap.set_random_seed(seed)
@@ -125,9 +140,58 @@ def _map(
     given = folder / _DATABASE, folder / _IMAGES, folder, options
     groups: dict[int, Any] = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
     if not groups:
-        return None
+        return 0
     largest = max(groups.values(), key=lambda group: (group.num_reg_images(), len(group.points3D)))
-    return model_of_colmap(largest, frame_of_image, size)
+    posed = sorted(largest.reg_image_ids())
+    for image, name in zip(posed, scene_names(len(posed))):
+        largest.image(image).name = f"{name}.jpg"
+    (folder / MODEL_FOLDER).mkdir(exist_ok=True)
+    largest.write(folder / MODEL_FOLDER)
+    return len(posed)
+
+
+def scene_names(count: int) -> list[str]:
+    """Return a scene's frame names without suffix; every 8th is for evaluation, but not the first of three or more.
+
+    >>> scene_names(5)[3:]
+    ['frame_eval_00004', 'frame_train_00005']
+    """
+    offset = min(EVAL_INTERVAL // 2, max(count - 2, 0)) if count > 1 else -1
+    digits = max(5, len(str(count)))
+    sets = ["eval" if number % EVAL_INTERVAL == offset else "train" for number in range(count)]
+    return [f"frame_{kind}_{number:0{digits}d}" for number, kind in enumerate(sets, start=1)]
+
+
+def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> SfmModel:
+    """Return the model that `find_poses` wrote to `folder`, from the photographs of frames `names`.
+
+    `size` is the original photographs' width and height, from which those for COLMAP may have been reduced.
+    """
+    import pycolmap
+
+    reconstruction: Any = pycolmap.Reconstruction(folder / MODEL_FOLDER)
+    posed = [reconstruction.images[number] for number in sorted(reconstruction.images)]
+    camera = reconstruction.cameras[posed[0].camera_id]
+    values: dict[str, Any] = lens_entries(camera.model.name, camera.params)
+    found = Camera(int(camera.width), int(camera.height), **values)
+    factor = 0.5 * (size[0] / found.width + size[1] / found.height)
+    ids = sorted(reconstruction.points3D)
+    points = [reconstruction.points3D[i] for i in ids]
+    number = {i: n for n, i in enumerate(ids)}
+    poses, seen = [], []
+    for image in posed:
+        poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
+        # A scene point may have two features in one photograph.
+        own = {number[feature.point3D_id] for feature in image.points2D if feature.has_point3D()}
+        seen.append(np.array(sorted(own), dtype=np.int64))
+    return SfmModel(
+        tuple(names[int(image.image_id) - 1] for image in posed),
+        found.resized(*size),
+        np.stack(poses),
+        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        np.array([point.error for point in points], dtype=np.float64) * factor,
+        tuple(seen),
+    )
 
 
 def image_pairs(count: int) -> IntArray:

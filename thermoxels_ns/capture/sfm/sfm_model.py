@@ -20,44 +20,24 @@ _SLOPE_RIDGE = 0.1  # keeps a plane's slope small if the points are on a line, o
 
 @dataclass(frozen=True)
 class SfmModel:
-    """Poses of the photographs and the scene points that they share, in one arbitrary unit of length.
-
-    Sighting number s is: frame `sighting_frame[s]` shows point `sighting_point[s]` at pixel `sighting_pixel[s]`. The
-    sightings are sorted by frame, then by point.
-    """
+    """Poses of the photographs and the scene points that they share, in one arbitrary unit of length."""
 
     frames: tuple[str, ...]  # names of the frames that have a pose, in order, all different
     camera: Camera  # lens of all photographs, at their original size
     camera_to_world: FloatArray  # poses, shape (f, 4, 4), camera axes x right, y up, z back, as in transforms.json
     points: FloatArray  # scene points, shape (n, 3), in world units
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    sighting_frame: IntArray  # index into `frames`, shape (s,)
-    sighting_point: IntArray  # index into `points`, shape (s,)
-    sighting_pixel: FloatArray  # where the frame shows the point, shape (s, 2), [pixels of the photographs]
+    seen: tuple[IntArray, ...]  # indices into `points` of the points that each frame shows, rising
 
     @property
     def centres(self) -> FloatArray:
         """Positions of the cameras in the world, shape (f, 3)."""
         return self.camera_to_world[:, :3, 3]
 
-    def seen_by(self, frame: int) -> tuple[IntArray, FloatArray]:
-        """Return the indices (m,) of the points that frame number `frame` shows, and their pixels (m, 2)."""
-        first, last = np.searchsorted(self.sighting_frame, [frame, frame + 1])
-        return self.sighting_point[first:last], self.sighting_pixel[first:last]
-
     def in_camera(self, frame: int, points: npt.ArrayLike) -> FloatArray:
         """Return world points (m, 3) in a frame's camera axes x right, y down, z ahead, shape (m, 3)."""
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
-
-    def sighting_error_px(self) -> FloatArray:
-        """Return the distance between each sighting's pixel and its point's projection, shape (s,), [pixels]."""
-        errors = [np.zeros(0)]
-        for frame in range(len(self.frames)):
-            seen, pixels = self.seen_by(frame)
-            projected = self.camera.project(self.in_camera(frame, self.points[seen]))
-            errors.append(np.linalg.norm(projected - pixels, axis=1))
-        return np.concatenate(errors)
 
     def moved(self, rotation: FloatArray, origin: FloatArray) -> SfmModel:
         """Return the model in new axes: p_new = rotation (p - origin), with `rotation` (3, 3) and `origin` (3,)."""

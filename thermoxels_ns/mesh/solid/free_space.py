@@ -164,7 +164,6 @@ def distance_to_ends(evidence: RayEvidence, shape: tuple[int, ...]) -> Float32Ar
     The distance is that along a ray from the centre to the ray's end, negative behind it, as a mean over the rays that
     cross the voxel within `REACH` of their ends (truncated signed distances, Curless and Levoy 1996).
     """
-    assert evidence.ends is not None and evidence.directions is not None
     size = math.prod(shape)
     total, count = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.int32)
     for off in np.arange(-REACH, REACH + _STEP, _STEP, dtype=np.float32):
@@ -186,7 +185,6 @@ def without_front(cells: BoolArray, evidence: RayEvidence, distance: Float32Arra
     as at a sheet thinner than a voxel. All stay if none would. `cells`, shape (nx-1, ny-1, nz-1), are the solid voxels;
     `distance` is the result of `distance_to_ends`.
     """
-    assert evidence.ends is not None and evidence.directions is not None
     with np.errstate(invalid="ignore"):
         kept = cells & ~(distance > 0.0)
     met = np.zeros(len(evidence.ends), dtype=bool)
@@ -199,7 +197,6 @@ def without_front(cells: BoolArray, evidence: RayEvidence, distance: Float32Arra
 
 def ends_in_voxels(evidence: RayEvidence, shape: tuple[int, ...]) -> IntArray:
     """Return the number of rays that end in each voxel, shape `shape`."""
-    assert evidence.ends is not None
     number = np.ravel_multi_index(tuple(_voxels_at(evidence.ends, shape)[0].T), shape)
     return np.bincount(number, minlength=math.prod(shape)).reshape(shape)
 

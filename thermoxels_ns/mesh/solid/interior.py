@@ -13,7 +13,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, grow
 
 LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
@@ -84,7 +84,7 @@ def cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray
 
     A cavity is empty voxels without a way out of the lattice through voxel faces.
     """
-    labels = face_connected(np.pad(~shell, 1, constant_values=True))
+    labels = connected(np.pad(~shell, 1, constant_values=True), connectivity=1)
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
     kept[[0, labels[0, 0, 0]]] = False
     labels = labels[1:-1, 1:-1, 1:-1]

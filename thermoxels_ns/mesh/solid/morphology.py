@@ -22,13 +22,11 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
     return tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in found[0])
 
 
-def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number, from 1 in C order of first voxels, 0 if empty; voxels of a body share faces."""
-    return connected(cells, connectivity=1)
-
-
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Return body numbers as `face_connected`; bodies join by faces (`connectivity` 1), edges (2) or corners (3)."""
+    """Return each voxel's body number, from 1 in C order of first voxels, 0 if empty.
+
+    Voxels are one body if they share faces (`connectivity` 1), edges (2) or corners (3).
+    """
     # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)

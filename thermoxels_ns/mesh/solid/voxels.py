@@ -240,24 +240,21 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
     the rays meet or exceed, kept within `OPTICAL_DEPTH_BOUNDS`: nearly all rays end on solid voxels.
 
     Voxels where rays spend weight but hardly any ray ends hold density from light that leaked past a surface. A few of
-    these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`. Without
-    `RayEvidence.ends` all voxels that reach the threshold are chosen.
+    these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`.
     """
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
-    cells = density >= np.float32(threshold)
-    if evidence.ends is not None:
-        passed = (ends_in_voxels(evidence, density.shape) <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
-        cells &= ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
+    passed = (ends_in_voxels(evidence, density.shape) <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
+    cells = (density >= np.float32(threshold)) & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     share = float(np.mean(met >= np.float32(threshold)))
     return Threshold(
         cells,
         threshold,
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
         f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel).",
-        by_rays=evidence.ends is not None,
+        by_rays=True,
     )
 
 
