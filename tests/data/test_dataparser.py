@@ -209,6 +209,15 @@ def look_away(scene) -> None:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
 
 
+def turn_photograph(scene) -> None:
+    """As a phone stores it that was held upright."""
+    scene.meta["frames"][3]["file_path"] = "images/turned.jpg"
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    Image.new("RGB", (18, 24)).save(scene.path / "images" / "turned.jpg", exif=tags)
+    (scene.path / "thermal" / "frame_train_003.png").rename(scene.path / "thermal" / "turned.png")
+
+
 def give_twice(scene) -> None:
     frames = scene.meta["frames"]
     frames.append(dict(frames[0], file_path="./images/../images/frame_train_000.png"))
@@ -361,6 +370,7 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (look_away, "cameras: .*in view"),
         (parallel, "--scene-box"),
         (give_twice, r"frame_train_000\.png more than once"),
+        (turn_photograph, "frame 3.*EXIF orientation 6"),
         (half_in_kelvin, r"most of the other files, got 293\.15 C"),
         (in_fahrenheit, r"near 15 to 25 C, .* got 84\.00 C in the middle.*correct the bounds"),
         (in_degrees_with_bounds_in_kelvins, r"20\.00 C in the middle"),

@@ -15,6 +15,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 
 _NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # k1 ... in nerfstudio's order
+_ORIENTATION = 0x0112
 _LONGEST_LENS = 1e4  # largest focal length relative to the photograph's side: an angle of view of 0.006 degrees
 _MOST_DISTORTION = 10.0
 """Largest shift of an image corner by one term of the distortion, in distances of the corner from the middle."""
@@ -67,11 +68,13 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         if model == "EQUIRECTANGULAR":
             undistort = "Cut each panorama into perspective photographs, each with its pose."
         raise SceneError(f"{where}: camera_model", expected=expected, got=model, remedy=undistort)
-    size = None
+    size, orientation = None, 1
     if image is not None:
         named = f"{where}: {image.name}"
         with errors_name(named, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(image) as opened:
             size = opened.size
+            if (values.get("h"), values.get("w")) == size:  # only then: reading EXIF of a PNG reads all pixels
+                orientation = int(opened.getexif().get(_ORIENTATION, 1))
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
             raise ValueError("true or false")
@@ -94,9 +97,14 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         expected = "numbers as intrinsics, six of them for distortion_params"
         raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
     _refuse_odd(camera, where)
+    if size is not None and (height, width) == size and orientation > 4:
+        expected = f"a photograph stored as {width} x {height} pixels, as the intrinsics say"
+        got = f"{size[0]} x {size[1]} and EXIF orientation {orientation}: it is stored on its side"
+        remedy = "Turn the photographs themselves: mogrify -auto-orient images/* (ImageMagick) does."
+        raise SceneError(where, expected=expected, got=got, remedy=remedy)
     if size is not None and (width, height) != size:
         expected, got = f"a photograph of {width} x {height} pixels as the intrinsics say", f"{size[0]} x {size[1]}"
-        remedy = "Use the photographs that the poses were computed from, turned alike, or scale the intrinsics."
+        remedy = "Use the photographs that the poses were computed from, or scale the intrinsics."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
     return camera
 
