@@ -12,8 +12,7 @@ from tests.support.shell_mesh import shell_mesh
 from tests.support.stuffed_shapes import SHAPES, tet_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import tolerance
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Varying
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
