@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.multiview.votes import air_voxels
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -41,15 +41,13 @@ class Rays:
 
     def __init__(self, places: torch.Tensor | None = None):
         self.places = torch.linspace(-0.97, 0.97, 30) if places is None else places
-        pose = torch.from_numpy(look_at((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))[:3]).float()
-        cameras = Cameras(torch.stack((pose, pose)), fx=50.0, fy=50.0, cx=50.0, cy=50.0, width=100, height=100)
-        self.train_dataset = SimpleNamespace(cameras=cameras)
+        poses = np.stack([look_at((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))[:3]] * 2)
+        self.views = Views(poses, np.full((2, 2), 50.0), np.full((2, 2), 50.0), np.full((2, 2), 100.0))
+        self.train_dataset = SimpleNamespace(views=lambda: self.views)
 
     def look_closer(self, camera: int) -> None:
         """Let a camera see 14 degrees around the x axis alone."""
-        cameras = self.train_dataset.cameras
-        cameras.fx, cameras.fy = cameras.fx.clone(), cameras.fy.clone()  # both cameras shared one number
-        cameras.fx[camera] = cameras.fy[camera] = 200.0
+        self.views.focal[camera] = 200.0
 
     def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
         y, z = torch.meshgrid(*[self.places] * 2, indexing="ij")
@@ -206,7 +204,7 @@ def test_where_no_two_photographs_show_anything_of_the_box_air_goes_all_the_same
     )
     model.feature_rays = FeatureRays(np.tile([-0.9, 0.0, 0.0], (25, 1)), np.arange(25), points, np.zeros(25))
     given: Any = attributes(model, 10)
-    given.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, [0, 2]] *= -1.0
+    given.pipeline.datamanager.views.camera_to_world[:, :, [0, 2]] *= -1.0
     next(steps_of(model, given, 1))
     air = torch.from_numpy(air_voxels(model.grid.lattice, model.feature_rays))
     assert bool(air.any()) and torch.equal(model.grid.kept, ~air)
