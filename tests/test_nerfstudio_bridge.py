@@ -101,9 +101,10 @@ def test_configs_of_all_methods_are_read():
     configs = deepcopy(list(all_methods.values()))  # what they share is written once
     for config in configs:
         vars(config).pop("_folder", None)  # that of a training in the same process
-    again = yaml.load(yaml.dump(configs), Loader=yaml.Loader)
+    text = yaml.dump(configs)
+    again = yaml.load(text, Loader=yaml.Loader)
     # Equality of dataclasses does not look at what a subclass compares by identity: look at the text as well.
-    assert again == configs and yaml.dump(again) == yaml.dump(configs)
+    assert again == configs and yaml.dump(again) == text
 
 
 class Harmful:
