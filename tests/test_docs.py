@@ -57,13 +57,8 @@ def test_the_tables_of_figures_show_the_kept_ones():
     ],
 )
 def test_figures_edited_by_hand_or_of_another_version_are_found(tmp_path, capsys, file, old, new, said):
-    for name in (
-        "tools/figures.py",
-        "README.md",
-        "docs/start.md",
-        "docs/figures.json",
-        "thermoxels_ns/core/version.py",
-    ):
+    names = ("tools/figures.py", "README.md", "docs/start.md", "docs/figures.json", "thermoxels_ns/core/version.py")
+    for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         text = (ROOT / name).read_text(encoding="utf-8")
         assert name != file or old in text

@@ -1,8 +1,6 @@
 import zipfile
-from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json, write_json
-from thermoxels_ns.core.yaml_records import read_yaml
+from thermoxels_ns.core.yaml_records import read_yaml, with_overrides
 
 ROOT = Path(__file__).resolve().parents[2]
 METHODS = {
@@ -24,26 +22,11 @@ OTHERS = ("patches-", "scene-", "conditions-", "house-corner-", "materials")
 METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
 
-def _leaves(content: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for key, value in content.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, (*above, key))
-        else:
-            yield (*above, key), value
-
-
-def _at(tree: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        tree = tree[key] if isinstance(tree, Mapping) else getattr(tree, key)
-    return list(tree) if isinstance(tree, tuple) else tree
-
-
 @pytest.mark.parametrize("name", METHOD_FILES)
 def test_a_method_has_the_values_of_its_file(name: str) -> None:
-    settings, method = dict(read_yaml(ROOT / "configs" / f"{name}.yaml")), METHODS[name]
-    assert method.description == settings.pop("description")
-    for path, value in _leaves(settings):
-        assert _at(method.config, path) == value, ".".join(path)
+    settings, method = read_yaml(ROOT / "configs" / f"{name}.yaml"), METHODS[name]
+    assert method.description == settings.pop("description") and method.config.method_name == name
+    assert with_overrides(method.config, settings) == method.config
 
 
 def test_methods_share_no_configuration() -> None:
