@@ -2,14 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.support.unreadable import forbid
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.images import read_photograph
-from thermoxels_ns.capture.rig_types import RigFrame
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_yaml
@@ -19,12 +16,6 @@ from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import _read_ply
 from thermoxels_ns.radiometry.thermogram import read_thermogram
 from thermoxels_ns.training.pipeline import load_checkpoint
-
-
-def read_rig_photograph(path: Path) -> None:
-    frame = RigFrame(path, np.zeros((3, 4)), np.zeros((0, 3)), np.zeros(0, np.int64))
-    read_photograph(frame)
-
 
 READERS = {
     "points.ply": _read_ply,
@@ -37,7 +28,6 @@ READERS = {
     "card.jpg": lambda path: identify(path, path.parent),
     "card.png": lambda path: identify(path, path.parent),
     "photograph.jpg": open_photograph,
-    "rig.jpg": read_rig_photograph,
     "cameras.bin": lambda path: read_model(path.parent),
     "cameras.txt": lambda path: read_model(path.parent),
     "step.ckpt": load_checkpoint,
