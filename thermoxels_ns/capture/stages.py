@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.folder_scan import scan_folder
-from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
+from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair, search_pairs
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
@@ -20,11 +20,9 @@ from thermoxels_ns.capture.scene_writer import Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, find_poses, read_poses
 from thermoxels_ns.capture.sfm.scale_and_up import scale_from_gps, scale_from_markers, upright
-from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER, fingerprint, load_rig, prepare_output, run_stage, save_rig
 from thermoxels_ns.core.checks import hold_folder, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
@@ -77,113 +75,80 @@ def run_capture(
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
-            return _Capture(source, folder, settings, say).run(write_page)
+            return _captured(source, folder, settings, write_page, say)
     finally:
         lock.release()
 
 
-@dataclass
-class _Capture:
-    """One capture while it runs. `poses` and `rig`, which take minutes, keep what they find."""
-
-    source: Path
-    output: Path
-    settings: CaptureSettings
-    say: Callable[[str], None]
-    dropped: dict[str, str] = field(default_factory=dict)
-    """Reason by name, for each file and frame that is left out; the stages add to this dictionary."""
-
-    def run(self, write_page: Callable[[CaptureResult], None]) -> CaptureResult:
-        """Run all stages in order and return what they found."""
-        search = search_pairs(self.source, self.settings, [self.output], self.say)
-        self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
-        self.dropped |= search.unpaired
-        read = self.temperatures(search.pairs)
-        found, key = self.poses(read)
-        frames = [frame for frame in read.frames if frame.name in found.frames]
-        scale, scale_missing = self.scale(found, frames)
-        model, up = upright(found, frames)
-        rig, start = self.rig(model, frames, read, scale, key)
-        drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
-        self.say(f"drift: {drift.explanation}")
-        moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
-        scene = Scene(frames, model, self.kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)
-        write_scene_folder(scene, self.output, self.say)
-        result = CaptureResult(self.source, self.output, search.pairs, self.dropped, read, scene, start, scale_missing)
-        write_page(result)
-        return result
-
-    def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
-        """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
-        read = read_frames(pairs, self.source, self.kept, self.settings, self.say)
-        width, height = read.thermal_size
-        self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
-        self.dropped |= read.dropped
-        return read
-
-    @property
-    def kept(self) -> Path:
-        """Folder of what is found before the scene is written."""
-        return self.output / CACHE_FOLDER
-
-    def poses(self, read: CaptureFrames) -> tuple[SfmModel, str]:
-        """Return camera, poses and scene points, which are found from the photographs, and the key of this result."""
-        settings = self.settings
-        names = ("image_size", "max_features", "lens", "seed", "threads")
+def _captured(
+    source: Path,
+    output: Path,
+    settings: CaptureSettings,
+    write_page: Callable[[CaptureResult], None],
+    say: Callable[[str], None],
+) -> CaptureResult:
+    """Run all stages of a capture and return what they found, see `run_capture`."""
+    kept = output / CACHE_FOLDER
+    search = search_pairs(source, settings, [output], say)
+    say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
+    read = read_frames(search.pairs, source, kept, settings, say)
+    say(f"temperatures: {len(read.frames)} thermal images of {read.thermal_size[0]} x {read.thermal_size[1]} pixels")
+    key = _keep_poses(read, source, kept / "poses", settings, say)
+    found = read_poses(kept / "poses", [frame.name for frame in read.frames], read.photograph_size)
+    say(f"poses: {len(found.frames)} of {len(read.frames)} frames, {len(found.points)} points")
+    few = "too few matches with the largest group of photographs that fit together"
+    alone = {frame.name: few for frame in read.frames if frame.name not in found.frames}
+    frames = [frame for frame in read.frames if frame.name in found.frames]
+    if settings.marker_side_m is not None:
+        photographs = {frame.name: frame.photograph for frame in frames}
+        scale, missing = scale_from_markers(found, photographs, settings.marker_side_m, settings.marker_error_m)
+    else:
+        scale, missing = scale_from_gps(found.centres, [frame.gps for frame in frames])
+    metres = None if scale is None else scale.metres_per_unit
+    say(f"scale: {missing}" if metres is None else f"scale: {metres:.5g} m per unit")
+    model, up = upright(found, frames)
+    start = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
+    in_rig = rig_frames(model, frames)
+    if settings.rig is not None:
+        rig = read_rig(settings.rig, read.thermal_size, metres)
+    else:
         depends = {
-            "options": {name: getattr(settings, name) for name in names},
-            "files": fingerprint([self.source / frame.name for frame in read.frames], self.source),
+            "options": {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)},
+            "start": [key, settings.thermal_field_of_view_deg, metres],
+            "files": fingerprint([source / frame.thermal_source for frame in read.frames], source),
         }
 
-        def work(folder: Path) -> None:
-            photographs = {frame.name: frame.photograph for frame in read.frames}
-            focal = [frame.focal_px for frame in read.frames if frame.focal_px]
-            middle = float(np.median(focal)) if focal else None
-            find_poses(photographs, read.photograph_size, folder, settings, middle, self.say)
+        def search_rig(folder: Path) -> None:
+            save_rig(folder / "rig.npz", estimate_rig(in_rig, model.camera, start, lambda line: say(f"rig: {line}")))
 
-        folder, again = self.kept / "poses", settings.from_stage == "poses"
-        key = run_stage(folder, depends, work, again, self.say)
-        model = read_poses(folder, [frame.name for frame in read.frames], read.photograph_size)
-        self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
-        few = "too few matches with the largest group of photographs that fit together"
-        self.dropped |= {frame.name: few for frame in read.frames if frame.name not in model.frames}
-        return model, key
+        run_stage(kept / "rig", depends, search_rig, settings.from_stage is not None, say)
+        rig = load_rig(kept / "rig" / "rig.npz")
+    say(f"rig: {rig.explanation}")
+    drift = estimate_drift(in_rig, rig.thermal_camera, rig.visible_to_thermal)
+    say(f"drift: {drift.explanation}")
+    moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
+    scene = Scene(frames, model, kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)
+    write_scene_folder(scene, output, say)
+    dropped = search.unpaired | read.dropped | alone
+    result = CaptureResult(source, output, search.pairs, dropped, read, scene, start, missing)
+    write_page(result)
+    return result
 
-    def scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
-        """Return metres per unit from markers, else from GPS; or None and the reason for None."""
-        settings = self.settings
-        if settings.marker_side_m is not None:
-            photographs = {frame.name: frame.photograph for frame in frames}
-            scale, missing = scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
-        else:
-            scale, missing = scale_from_gps(model.centres, [frame.gps for frame in frames])
-        self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
-        return scale, missing
 
-    def rig(
-        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None, poses: str
-    ) -> tuple[RigEstimate, RigEstimate]:
-        """Return the rig (found from the images, or given by the user) and the start of its search.
+def _keep_poses(
+    read: CaptureFrames, source: Path, folder: Path, settings: CaptureSettings, say: Callable[[str], None]
+) -> str:
+    """Find poses and scene points from the photographs, or keep those in `folder`; return the key of the result."""
+    names = ("image_size", "max_features", "lens", "seed", "threads")
+    depends = {
+        "options": {name: getattr(settings, name) for name in names},
+        "files": fingerprint([source / frame.name for frame in read.frames], source),
+    }
 
-        `poses` is the key of the result that `model` came from.
-        """
-        settings = self.settings
-        angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
-        begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
-        if settings.rig is not None:
-            rig = read_rig(settings.rig, read.thermal_size, metres)
-        else:
-            depends = {
-                "options": {each.name: getattr(settings, each.name) for each in fields(RadiometryOptions)},
-                "start": [poses, angle, metres],
-                "files": fingerprint([self.source / frame.thermal_source for frame in read.frames], self.source),
-            }
+    def work(folder: Path) -> None:
+        photographs = {frame.name: frame.photograph for frame in read.frames}
+        focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+        middle = float(np.median(focal)) if focal else None
+        find_poses(photographs, read.photograph_size, folder, settings, middle, say)
 
-            def work(folder: Path) -> None:
-                say = lambda line: self.say(f"rig: {line}")  # noqa: E731
-                save_rig(folder / "rig.npz", estimate_rig(rig_frames(model, frames), model.camera, begin, say))
-
-            run_stage(self.kept / "rig", depends, work, settings.from_stage is not None, self.say)
-            rig = load_rig(self.kept / "rig" / "rig.npz")
-        self.say(f"rig: {rig.explanation}")
-        return rig, begin
+    return run_stage(folder, depends, work, settings.from_stage == "poses", say)
