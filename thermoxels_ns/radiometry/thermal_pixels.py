@@ -27,15 +27,7 @@ from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
 ThermalFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "JPEG", "TIFF", "PNG", "NPY", "CSV"]
-THERMAL_SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".tif",
-    ".tiff",
-    ".npy",
-    ".csv",
-)
+THERMAL_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".csv")
 """Suffixes of thermal files and photographs; other files of a folder (videos, logs) are passed over."""
 _HEAD_BYTES = 4096
 _STARTS: dict[bytes, ThermalFormat] = {
@@ -147,12 +139,11 @@ def read_thermal_file(path: Path, unit: ThermalUnit) -> Float32Array:
         expected = "one temperature per pixel, shape (height, width)"
         remedy = "Export a single-channel thermal image."
         raise ThermalFileError(str(path), expected=expected, got=f"shape {values.shape}", remedy=remedy)
-    saturated = np.zeros(values.shape, dtype=bool)
     if unit.kind == "linear" and (values.dtype.kind in "ui" or found == "TIFF"):
+        celsius = values.astype(np.float64) * unit.scale + unit.offset_c
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
-            saturated = (values == ends.min) | (values == ends.max)
-        celsius = values.astype(np.float64) * unit.scale + unit.offset_c
+            celsius[(values == ends.min) | (values == ends.max)] = np.nan  # saturated
     elif values.dtype.kind == "f":
         celsius = values.astype(np.float64)
     elif unit.kind == "bounds" and found not in ("TIFF", "NPY") and values.dtype in (np.uint8, np.uint16):
@@ -169,15 +160,13 @@ def read_thermal_file(path: Path, unit: ThermalUnit) -> Float32Array:
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
         celsius[no_data] = np.nan
-    return masked_image(celsius, saturated)
+    return masked_image(celsius)
 
 
-def masked_image(temperature_c: npt.NDArray[np.floating], saturated: BoolArray | None = None) -> Float32Array:
-    """Return temperatures (height, width) [degrees C], NaN where not finite, saturated or outside `VALID_RANGE_C`."""
+def masked_image(temperature_c: npt.NDArray[np.floating]) -> Float32Array:
+    """Return temperatures (height, width) [degrees C], NaN where not finite or outside `VALID_RANGE_C`."""
     with np.errstate(invalid="ignore"):
         good = (temperature_c >= VALID_RANGE_C[0]) & (temperature_c <= VALID_RANGE_C[1])
-    if saturated is not None:
-        good &= ~saturated
     return np.where(good, temperature_c, np.nan).astype(np.float32)
 
 

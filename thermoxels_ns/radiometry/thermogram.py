@@ -95,12 +95,11 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         if found == "FLIR R-JPEG":
             flir = read_flir_jpeg(path)
             conditions = options.applied_to(flir.camera.conditions)
-            temperature_c = masked_image(flir.temperature_c(conditions))
+            temperature_c = flir.temperature_c(conditions)
             camera, angle = flir.camera.model, flir.camera.field_of_view_deg
             metadata = ThermogramMetadata(found, camera, angle, conditions, flir.picture_in_picture)
         elif found == "DJI R-JPEG":
             temperature_c, conditions = read_dji_rjpeg(path, options)
-            temperature_c = masked_image(temperature_c)
             with Image.open(path) as opened:
                 metadata = ThermogramMetadata(found, read_exif_facts(opened)[0], conditions=conditions)
         elif found == "JPEG":
@@ -111,7 +110,7 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
         else:
             temperature_c, metadata = _read_stored(path, found, options)
-    return Thermogram(temperature_c, metadata)
+    return Thermogram(masked_image(temperature_c), metadata)
 
 
 def _read_stored(
@@ -142,7 +141,7 @@ def _read_stored(
     per_count = unit.scale if picture and unit.kind == "linear" else None
     metadata = ThermogramMetadata(found, camera, conditions=conditions, celsius_per_count=per_count)
     if conditions != Conditions():
-        temperature_c = masked_image(corrected_temperature_c(temperature_c, conditions))
+        temperature_c = corrected_temperature_c(temperature_c, conditions)
     return temperature_c, metadata
 
 
