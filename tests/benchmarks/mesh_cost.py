@@ -52,7 +52,7 @@ def body_named(name: str) -> Body:
     """One of the known shapes, or the exact solid of a synthetic scene."""
     if name in SHAPES:
         shape = SHAPES[name]
-        return Body(shape.distance, shape.area, shape.volume, ((-0.9, -0.9, -0.9), (0.9, 0.9, 0.9)))
+        return Body(shape.distance, shape.area, shape.volume, ((-0.88, -0.88, -0.88), (0.88, 0.88, 0.88)))
     scene = make_scene(name)
     return Body(scene.solid.signed_distance, scene.solid.area, scene.solid.volume, scene.scene_box)
 
