@@ -64,22 +64,22 @@ NEVER = {
 
 MOST_LINES = {
     "audit": 3345,
-    "capture": 3370,
-    "commands": 2500,
+    "capture": 3080,
+    "commands": 2490,
     "core": 1860,
-    "data": 2465,
+    "data": 2385,
     "evaluation": 385,
-    "fem": 2805,
+    "fem": 2700,
     "field": 885,
-    "heat": 2390,
-    "mesh": 4665,
+    "heat": 2345,
+    "mesh": 4650,
     "multiview": 1885,
-    "radiometry": 1315,
+    "radiometry": 1240,
     "render": 1665,
-    "reports": 1245,
+    "reports": 1240,
     "synthetic": 2750,
     "training": 2715,
-    "root": 650,
+    "root": 645,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
