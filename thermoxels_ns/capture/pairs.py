@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFold
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.core.errors import SceneError, printable
 
-_DJI_TIME = re.compile(r"\d{14}")
-"""Word of DJI's names with the time, which may differ by seconds between the images of one shot."""
+_DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
+_DJI_LATE_S = 3.0  # largest difference between the time stamps of the two images of one shot, [s]
+_DJI_PHOTOGRAPHS = ("v", "w")
+"""Letters of DJI's photographs, preferred letter first. The zoom camera's z is not used: its focal length varies."""
 _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
 _CLEARLY_NEARER = 2.0
 _CLOCK_STEP_S = 0.5
@@ -81,24 +84,28 @@ def search_pairs(
 
 
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
-    """Pair photographs and thermal images by three rules in turn: in one file, equal names, time.
+    """Pair photographs and thermal images by four rules in turn: in one file, DJI's names, equal names, time.
 
     Names are compared without words for the kind of image: ``10-58-15-636-visible.jpg`` pairs with
-    ``10-58-15-636-radiometric.tiff``, DJI_0001_V with DJI_0001_T. Two files pair by time if each is the other's
-    nearest, at most `time_limit_s` away, and no second file is about as near. The thermal camera's clock is ahead by
-    `clock_offset_s`.
+    ``10-58-15-636-radiometric.tiff``. Two files pair by time if each is the other's nearest, at most `time_limit_s`
+    away, and no second file is about as near. The thermal camera's clock is ahead by `clock_offset_s`.
     """
-    both = [(file, file, "both in one file") for file in found.files if file.role == "both"]
+    pairs: list[tuple[CameraFile, CameraFile, str]] = []
+    unpaired = dict[Path, str]()
+    both = [file for file in found.files if file.role == "both"]
+    pairs += [(file, file, "both in one file") for file in both]
     photographs = [file for file in found.files if file.role == "photograph"]
     thermal = [file for file in found.files if file.role in ("thermal", "thermal picture")]
-    named, unclear = _by_names(photographs, thermal, found.folder)
-    used = {file.path for pair in named for file in pair[:2]}
-    used |= {file.path for file in thermal if file.role == "thermal picture" and file.path in unclear}
-    left = [[file for file in side if file.path not in used] for side in (photographs, thermal)]
-    timed, explained = _by_time(left[0], left[1], time_limit_s, clock_offset_s)
-    pairs = [*both, *named, *timed]
-    paired = {file.path for pair in timed for file in pair[:2]}
-    unpaired = explained | {path: why for path, why in unclear.items() if path not in paired}
+    for step in (_by_dji_names, partial(_by_names, folder=found.folder)):
+        matched, explained = step(photographs, thermal)
+        pairs += matched
+        unpaired |= explained
+        used = {file.path for pair in matched for file in pair[:2]} | set(explained)
+        photographs = [file for file in photographs if file.path not in used]
+        thermal = [file for file in thermal if file.path not in used]
+    matched, explained = _by_time(photographs, thermal, time_limit_s, clock_offset_s)
+    pairs += matched
+    unpaired |= explained
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
     left_out = sorted(unpaired.items(), key=lambda item: natural_key(item[0]))
     return PairSearch(
@@ -112,6 +119,44 @@ def _name(path: Path, folder: Path) -> str:
 
 
 _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
+
+
+def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
+    """Pair DJI_0001_T with DJI_0001_V (or _W); times in the two names may differ by up to `_DJI_LATE_S`."""
+    taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
+    for file in (*photographs, *thermal):
+        match = _DJI.match(file.path.stem.lower())
+        if match:
+            taken[(file.path.parent, match["head"], match["number"], match["tail"])].append((match, file))
+    pairs, others = [], []
+    for group in taken.values():
+        photos = [(match, file) for match, file in group if file.role == "photograph"]
+        for match, file in group:
+            if match["role"] != "t" or file.role == "photograph":
+                continue
+            near = [(m["role"], f) for m, f in photos if _seconds_apart(m, match) <= _DJI_LATE_S]
+            sides = [[f for letter, f in near if letter == each] for each in _DJI_PHOTOGRAPHS]
+            best = next((side for side in sides if side), [])
+            if len(best) == 1:
+                pairs.append((best[0], file, "DJI's names"))
+                others.append([f.path for _, f in near if f is not best[0]])
+    counted = Counter(photo.path for photo, _, _ in pairs)
+    clear, explained = [], dict[Path, str]()
+    for pair, rest in zip(pairs, others):
+        if counted[pair[0].path] == 1:
+            clear.append(pair)
+            explained |= {path: f"{pair[0].path.name} is the partner of {pair[1].path.name}" for path in rest}
+    return clear, {path: why for path, why in explained.items() if path not in counted}
+
+
+def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
+    if not first["time"] or not second["time"]:
+        return 0.0 if first["time"] == second["time"] else np.inf
+
+    def seconds(digits: str) -> int:
+        return int(digits[6:8]) * 86400 + int(digits[8:10]) * 3600 + int(digits[10:12]) * 60 + int(digits[12:])
+
+    return abs(seconds(first["time"]) - seconds(second["time"]))
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
@@ -138,8 +183,6 @@ def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], 
             for picture in pictures if thermals else []:
                 explained[picture.path] = f"a picture for the eye; the temperatures are in {thermals[0].path.name}"
             thermals = thermals or pictures
-            if len(photos) > 1:  # of DJI's photographs of one shot, _V is preferred to _W
-                photos = [file for file in photos if "v" in words_of(file.path.stem)] or photos
             if len(photos) == 1 and len(thermals) == 1:
                 pairs.append((photos[0], thermals[0], "equal names"))
             elif photos and thermals:
@@ -153,8 +196,6 @@ def _shot(stem: str) -> tuple[str, ...]:
     """Return the words of a file name (`words_of`) that identify the shot, without words for the kind of image."""
     words = words_of(stem)
     kept = tuple(word for word in words if word not in ROLE_WORDS)
-    if "dji" in words:  # as in DJI_20220723151219_0001_T_waypoint1
-        kept = tuple(word for word in kept if word not in _LAST_LETTERS and not _DJI_TIME.fullmatch(word))
     if len(kept) > 1 and kept[-1] in _LAST_LETTERS:
         kept = kept[:-1]
     return kept or words
