@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
+import base64
+import binascii
 import json
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -40,6 +42,7 @@ _REMEDY = "Export the mesh again with ns-export thermoxels-mesh, or correct the 
 _REGION = "region:"
 _TETRAHEDRON = 10  # VTK's number for tetrahedra
 _DISK_IS_FULL = 20007  # VTK's error code
+_MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
 def write_vtu(path: Path | str, mesh: TetMesh) -> None:
@@ -67,9 +70,7 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
         writer.SetCompressionLevel(1)  # a quarter of the time of the default, for files 5 % larger
         with silent_vtk():
             written = writer.Write() and not writer.GetErrorCode() and temporary.is_file()
-        if written:
-            temporary.write_bytes(_with_checksum(temporary.read_bytes()))
-        else:
+        if not written:
             remedy = "Check the free space and the permissions of the folder."
             code = writer.GetErrorCode()  # codes below 20,000 are those of the system
             got = "no space left for it" if code == _DISK_IS_FULL else os.strerror(code)
@@ -216,9 +217,9 @@ def _read(path: Path) -> Any:
     reader.SetFileName(str(path))
     data = None
     with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError):
-        whole = _is_whole(path.read_bytes())
+        sound = _sizes_fit(path.read_bytes())
     with silent_vtk() as complaints:
-        if whole and reader.CanReadFile(str(path)):
+        if sound and reader.CanReadFile(str(path)):
             reader.Update()
             data = pv.wrap(reader.GetOutput())
     if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
@@ -226,20 +227,36 @@ def _read(path: Path) -> Any:
     return data
 
 
-def _with_checksum(content: bytes) -> bytes:
-    """Return the content of a VTK file with a comment behind its first line that holds the checksum of the rest."""
-    first, _, rest = content.partition(b"\n")
-    return b"%b\n<!-- sha256 %b -->\n%b" % (first, hashlib.sha256(rest).hexdigest().encode(), rest)
+def _sizes_fit(content: bytes) -> bool:
+    """Return whether the array sizes in a VTK file made by `write_vtk` are no larger than its bytes can hold.
 
-
-def _is_whole(content: bytes) -> bool:
-    """Return whether a VTK file fits its checksum; True without one, as in files of other programs.
-
-    VTK ends the process where a damaged size exceeds the memory.
+    VTK ends the process if a damaged size exceeds the memory. For files in another layout the result is True.
     """
-    first, _, rest = content.partition(b"\n")
-    comment, _, rest = rest.partition(b"\n")
-    return not comment.startswith(b"<!--") or content == _with_checksum(first + b"\n" + rest)
+    header = re.search(rb'header_type="UInt(32|64)"[^>]*compressor="vtkZLibDataCompressor"', content)
+    begin = re.search(rb'<AppendedData encoding="base64">\s*_', content)
+    if header is None or begin is None:
+        return True
+    width = int(header[1]) // 8
+    for offset in re.findall(rb'offset="(\d+)', content[: begin.start()]):
+        start = begin.end() + int(offset)
+        # An array begins with the number of blocks, the size of a block and of the last, and each compressed size.
+        blocks, size, last = _numbers(content[start : start + 4 * width], width, 3)
+        if blocks * width > len(content) or max(blocks * size, last) > _MOST_COMPRESSION * len(content):
+            return False
+        letters = -(-(3 + blocks) * width // 3) * 4
+        if sum(_numbers(content[start : start + letters], width, 3 + blocks)[3:]) > len(content):
+            return False
+    return True
+
+
+def _numbers(letters: bytes, width: int, count: int) -> list[int]:
+    """Decode `count` little-endian numbers of `width` bytes from base64; bytes missing or not base64 become 255."""
+    try:
+        found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
+    except binascii.Error:
+        found = b""
+    whole = found + b"\xff" * max(0, width * count - len(found))
+    return [int.from_bytes(whole[width * k : width * (k + 1)], "little") for k in range(count)]
 
 
 def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
