@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from tests.support.camera_card import photograph
 from tests.support.posed_model import ring_model
@@ -20,6 +21,7 @@ from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.scene_scale import SceneScale, scale_from_scene_file, up_from_scene_file
@@ -33,7 +35,7 @@ ANGLE_DEG = float(2 * np.degrees(np.arctan(THERMAL.width / 2 / THERMAL.fl_x)))
 
 
 def settings(**more) -> CaptureSettings:
-    return CaptureSettings(max_features=500, thermal_field_of_view_deg=ANGLE_DEG, **more)
+    return CaptureSettings(**({"max_features": 500, "thermal_field_of_view_deg": ANGLE_DEG} | more))
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +234,8 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     assert sorted(map(len, tracks.seen.values())) == sorted(map(len, scene.model.seen))
     train = sum(len(points) for name, points in tracks.seen.items() if "train" in name)
     assert 0.5 * train < len(outputs.metadata["feature_rays"].origins) <= train
+    stock = NerfstudioDataParserConfig(data=folder, load_3D_points=False, eval_mode="all").setup()
+    assert len(stock.get_dataparser_outputs("train").image_filenames) == COUNT
 
 
 def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, monkeypatch):
@@ -281,6 +285,18 @@ def test_a_given_rig_is_taken_and_from_stage_finds_it_again(capture, tmp_path):
     again = capture_folder(card, scene, settings(from_stage="rig", skip_bad=True), said.append)
     assert [line for line in said if "as before" in line] == 2 * ["poses: as before"]
     np.testing.assert_array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
+    capture_folder(card, scene, settings(thermal_field_of_view_deg=ANGLE_DEG + 1.0, skip_bad=True), said.append)
+    assert [line for line in said if "as before" in line] == 3 * ["poses: as before"]
+
+
+@pytest.mark.parametrize("name", ["poses/model/points3D.bin", "rig/rig.npz"])
+def test_damaged_results_of_an_earlier_capture_name_the_stage_to_repeat(capture, tmp_path, name):
+    card, earlier, _, _ = capture
+    shutil.copytree(earlier, tmp_path / "scene")
+    kept = tmp_path / "scene" / ".capture" / name
+    kept.write_bytes(kept.read_bytes()[: kept.stat().st_size // 2])
+    with pytest.raises(ThermoxelsError, match=f"--from-stage {name.split('/')[0]}"):
+        capture_folder(card, tmp_path / "scene", settings(skip_bad=True))
 
 
 def test_the_command(capture, tmp_path, capsys):

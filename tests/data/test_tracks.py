@@ -65,6 +65,13 @@ def test_points_of_a_model_wherever_it_may_lie_make_lines_and_the_box(scene_fold
     assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all() and np.abs(box).max() < 0.6
 
 
+def test_a_scene_captured_by_an_earlier_version_says_why_it_trains_without_tracks(scene, capsys):
+    scene.meta["tracks_file_path"] = "sparse_tracks.npz"
+    scene.rewrite()
+    assert lines_of(scene).metadata["feature_rays"] is None
+    assert "capture the scene again" in " ".join(capsys.readouterr().out.split())
+
+
 def test_the_json_says_how_its_world_differs_from_the_models(scene):
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
     add_model(scene, turn=turn.T, shift=(0.0, 0.0, 1.0))

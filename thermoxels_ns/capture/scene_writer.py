@@ -25,7 +25,7 @@ from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS
 from thermoxels_ns.data.scene_scale import SceneScale
 
 JSON_NAME = "transforms.json"
-_FOLDERS = ("images", "thermal", "colmap")
+_FOLDERS = ("images", "thermal", COLMAP_FOLDERS[0])
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 
 
@@ -54,11 +54,12 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         entries.append(_write_frame(scene, number, frame, name, new))
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
-    shutil.copytree(scene.colmap, new / COLMAP_FOLDERS[0])
+    shutil.copytree(scene.colmap, new / COLMAP_FOLDERS[0], dirs_exist_ok=True)
     write_json(new / JSON_NAME, _content(scene, entries))
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
+        writable_folder((output / name).parent)
         (new / name).rename(output / name)
     (new / JSON_NAME).replace(output / JSON_NAME)
     shutil.rmtree(new, ignore_errors=True)
@@ -94,7 +95,7 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
         "thermal_camera": rig.thermal_camera.entries(),
         "pixel_convention": "the centre of the top left pixel is at (0.5, 0.5)",
         "up": scene.up.direction.tolist(),
-        "applied_transform": scene.moved.tolist(),
+        "applied_transform": scene.moved[:3].tolist(),
         "rig": rig.visible_to_thermal.tolist(),
         "rig_info": {
             "meaning": "x_thermal = rig @ x_visible, both in OpenCV camera axes, translation in units of the scene",

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -90,10 +91,10 @@ def load_rig(path: Path) -> RigEstimate:
     try:
         with np.load(path, allow_pickle=False) as opened:
             values = {name: opened[name].tolist() if opened[name].ndim < 2 else opened[name] for name in opened.files}
-    except (OSError, ValueError, KeyError) as problem:
+        width, height, *numbers = values["thermal_camera"]
+        return RigEstimate(**{**values, "thermal_camera": Camera(int(width), int(height), *numbers)})
+    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as problem:
         expected, got = "what an earlier capture wrote", str(problem) or type(problem).__name__
         raise ThermoxelsError(
             str(path), expected=expected, got=got, remedy="Run it with --from-stage rig."
         ) from problem
-    width, height, *numbers = values["thermal_camera"]
-    return RigEstimate(**{**values, "thermal_camera": Camera(int(width), int(height), *numbers)})

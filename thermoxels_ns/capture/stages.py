@@ -54,7 +54,7 @@ def run_capture(
     write_page: Callable[[CaptureResult], None],
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureResult:
-    """Turn a folder of camera files into a scene, a page and the stages' results in `output`.
+    """Turn a folder of camera files into a scene, a page and what took minutes to find, in `output`.
 
     `write_page` writes the report at the end. `say` is called with one line of progress at a time.
 
@@ -73,7 +73,7 @@ def run_capture(
     lock = hold_folder(folder / CACHE_FOLDER / "lock", remedy, say)
     try:
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
-        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+        remedy = "Check free space and permissions, and run the command again: poses and rig that were found are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
             return _captured(source, folder, settings, write_page, say)
     finally:

@@ -27,8 +27,8 @@ class Capture(CaptureSettings):
     source: tyro.conf.Positional[Path] = field(kw_only=True)
     """Folder of camera files; it is only read."""
     output: Path = field(kw_only=True)
-    """Folder for the scene and capture.html; made if it does not exist. If the folder holds an earlier capture, it is
-    continued where it stopped."""
+    """Folder for the scene and capture.html; made if it does not exist. If the folder holds an earlier capture, its
+    poses and rig are kept where nothing that they depend on has changed, and the scene is written anew."""
 
     def main(self) -> None:
         """Run the capture; raises `ThermoxelsError` for unusable files or options, and without pairs or poses."""

@@ -46,6 +46,7 @@ class ThermalDataset(InputDataset):
             # `scale_factor` changes the resolution of the photographs, not of the thermal images.
             self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
         self._thermal: dict[int, tuple[Tensor, Tensor]] = {}
+        self._masked = dict[int, tuple[int, int]]()  # Masked and all pixels of a thermal image
 
     @property
     def shares_camera(self) -> bool:
@@ -138,6 +139,7 @@ class ThermalDataset(InputDataset):
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
             temperature_c = read_thermal_file(path, given["thermal_unit"])
             valid = np.isfinite(temperature_c)
+            self._masked[image_idx] = int((~valid).sum()), valid.size
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0)
@@ -150,8 +152,9 @@ class ThermalDataset(InputDataset):
 
     def thermal_report(self) -> str:
         """Return in words how many pixels of the split's thermal images are masked."""
-        valid = [self.get_thermal(index)[1] for index in range(len(self))]
-        pixels, masked = sum(one.numel() for one in valid), sum(int((~one).sum()) for one in valid)
+        for index in range(len(self)):
+            self.get_thermal(index)
+        masked, pixels = (sum(count) for count in zip((0, 0), *self._masked.values()))
         return f"{masked} of {pixels} pixels masked ({masked / max(pixels, 1):.2%})"
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:

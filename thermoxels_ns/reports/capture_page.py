@@ -109,12 +109,11 @@ def capture_page(
     `temperatures_c` is a sample of corrected temperatures; `masked_share` is the share of masked thermal pixels.
     """
     scene, rig = result.scene, result.scene.rig
-    error_px, known_c = scene.model.point_error_px, temperatures_c[np.isfinite(temperatures_c)]
-    errors = error_px[np.concatenate(scene.model.seen)]
+    errors, known_c = np.concatenate(scene.model.errors_px), temperatures_c[np.isfinite(temperatures_c)]
     off = {**rig.standard_errors, "focal": rig.standard_errors["log_focal"] * rig.thermal_camera.fl_x}
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
-        own = error_px[scene.model.seen[index]]
+        own = scene.model.errors_px[index]
         frames.append((name, frame, len(own), f"{np.median(own):.2f}" if len(own) else "-"))
     return build_page(
         "capture.html.j2",

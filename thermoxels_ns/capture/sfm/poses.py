@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.data.colmap_model import PARAMETERS, lens_entries
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.data.colmap_model import PARAMETERS, lens_entries, read_model
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
@@ -75,10 +76,13 @@ def find_poses(
         with threadpool_limits(1, "blas"):  # pycolmap has its own BLAS, whose sums depend on its number of threads
             _find_and_match(folder, names, params, settings, say)
             posed = _map(folder, len(names), settings.seed, say)
-    except OSError:
+    except (ThermoxelsError, OSError):
         raise
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError and others
-        remedy = "Check free space; if that does not help, begin anew with --from-stage poses."
+        remedy = (
+            "Check free space and memory (lower --threads, --image-size or --max-features); if that does not help, "
+            "begin anew with --from-stage poses."
+        )
         raise ThermoxelsError("COLMAP", expected="to finish its work", got=problem, remedy=remedy) from problem
     if posed < MIN_FRAMES:
         raise _too_few(posed, "photographs that fit together")
@@ -145,8 +149,15 @@ def _map(folder: Path, count: int, seed: int, say: Callable[[str], None]) -> int
     posed = sorted(largest.reg_image_ids())
     for image, name in zip(posed, scene_names(len(posed))):
         largest.image(image).name = f"{name}.jpg"
-    (folder / MODEL_FOLDER).mkdir(exist_ok=True)
-    largest.write(folder / MODEL_FOLDER)
+    new = writable_folder(folder / f"new-{MODEL_FOLDER}")
+    largest.write(new)
+    try:
+        read_model(new)  # COLMAP does not notice a full disk
+    except SceneError as problem:
+        expected, got = f"to write {folder / MODEL_FOLDER}", "files that are cut off"
+        raise OutputError("poses", expected=expected, got=got, remedy="Check free space.") from problem
+    shutil.rmtree(folder / MODEL_FOLDER, ignore_errors=True)
+    new.rename(folder / MODEL_FOLDER)
     return len(posed)
 
 
@@ -165,10 +176,16 @@ def scene_names(count: int) -> list[str]:
 def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> SfmModel:
     """Return the model that `find_poses` wrote to `folder`, from the photographs of frames `names`.
 
-    `size` is the original photographs' width and height, from which those for COLMAP may have been reduced.
+    `size` is the original photographs' width and height, from which those for COLMAP may have been reduced. Raises
+    `SceneError` for a damaged model.
     """
     import pycolmap
 
+    try:
+        read_model(folder / MODEL_FOLDER)  # pycolmap reads a file that is cut off for ever
+    except SceneError as problem:
+        remedy = "Find the poses again with --from-stage poses."
+        raise SceneError("poses", expected="those that were kept", got=problem, remedy=remedy) from problem
     reconstruction: Any = pycolmap.Reconstruction(folder / MODEL_FOLDER)
     posed = [reconstruction.images[number] for number in sorted(reconstruction.images)]
     camera = reconstruction.cameras[posed[0].camera_id]
@@ -178,19 +195,24 @@ def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> Sfm
     ids = sorted(reconstruction.points3D)
     points = [reconstruction.points3D[i] for i in ids]
     number = {i: n for n, i in enumerate(ids)}
-    poses, seen = [], []
+    places = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    poses, seen, errors_px = [], [], []
     for image in posed:
         poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
-        # A scene point may have two features in one photograph.
-        own = {number[feature.point3D_id] for feature in image.points2D if feature.has_point3D()}
+        # A scene point may have two features in one photograph; the first counts.
+        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
         seen.append(np.array(sorted(own), dtype=np.int64))
+        pixels, world_to_camera = np.array([own[n] for n in seen[-1]]).reshape(-1, 2), image.cam_from_world().matrix()
+        shown = found.project(places[seen[-1]] @ world_to_camera[:, :3].T + world_to_camera[:, 3])
+        errors_px.append(np.linalg.norm(shown - pixels, axis=1) * factor)
     return SfmModel(
         tuple(names[int(image.image_id) - 1] for image in posed),
         found.resized(*size),
         np.stack(poses),
-        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        places,
         np.array([point.error for point in points], dtype=np.float64) * factor,
         tuple(seen),
+        tuple(errors_px),
     )
 
 

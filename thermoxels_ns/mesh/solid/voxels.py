@@ -205,7 +205,7 @@ class Threshold:
     cells: BoolArray  # True where a voxel is dense enough and rays do not rule it out, shape `lattice.cell_shape`
     density: float  # least density at the centre of a voxel that is dense enough, [1 / world unit]
     explanation: str  # one or two sentences on which rule chose the threshold, and why
-    by_rays: bool = False  # True if training rays chose the threshold, and it is known where they end
+    by_rays: bool = False  # True if training rays chose the threshold
 
 
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
