@@ -104,6 +104,15 @@ def test_the_scene_is_that_of_the_truth_with_z_up(capture):
     assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
 
 
+def test_errors_of_photographs_are_those_whose_means_colmap_gives_to_points(capture):
+    model = capture[2].scene.model
+    numbers, errors = np.concatenate(model.seen), np.concatenate(model.errors_px)
+    count = np.bincount(numbers, minlength=len(model.points))
+    mean = np.bincount(numbers, errors, len(model.points)) / count
+    # COLMAP counts both features of a photograph that shows a point twice.
+    assert np.mean(np.isclose(mean, model.point_error_px, rtol=1e-6, atol=1e-9)) > 0.95
+
+
 def test_the_page_shows_everything_and_fetches_nothing(capture):
     whole = capture[2].page.read_text()
     page = re.sub(r'data:image/jpeg;base64,[^"]+', "data:", whole)  # any four letters stand somewhere in megabytes
@@ -240,9 +249,12 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
 
 def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, monkeypatch):
     scene, folder = written
-    (folder / "notes.txt").write_text("mine")
+    mine = (folder / "notes.txt", folder / "colmap" / "mine" / "notes.txt")
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
     write_scene_folder(scene, folder)
-    assert (folder / "notes.txt").read_text() == "mine"
+    assert [path.read_text() for path in mine] == ["mine", "mine"]
     before = (folder / "transforms.json").read_bytes()
 
     def stop(*_):

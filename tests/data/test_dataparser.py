@@ -178,6 +178,7 @@ def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_traini
         np.testing.assert_allclose(averaged[..., 0], total / np.maximum(count, 1), atol=1e-6)
     else:
         assert not given[1].shares_camera and averaged.shape == thermal.shape
+    assert given[1].thermal_report() == given[0].thermal_report() and given[0].thermal_report().startswith("10 of ")
     held_out = parse(scene.path, "val", photographs_gb=room)
     assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["image_scale"] == 1.0
     typed = parse(scene.path, photographs_gb=room, downscale_factor=1)

@@ -69,7 +69,7 @@ def test_a_scene_captured_by_an_earlier_version_says_why_it_trains_without_track
     scene.meta["tracks_file_path"] = "sparse_tracks.npz"
     scene.rewrite()
     assert lines_of(scene).metadata["feature_rays"] is None
-    assert "capture the scene again" in " ".join(capsys.readouterr().out.split())
+    assert "Capture the scene again" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_json_says_how_its_world_differs_from_the_models(scene):

@@ -23,6 +23,8 @@ def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float =
         points=on_wall / unit_m,
         point_error_px=np.zeros(points),
         seen=(),
+        errors_px=(),
     )
     places = (CAMERA.project(model.in_camera(index, model.points)) for index in range(count))
-    return replace(model, seen=tuple(np.flatnonzero(CAMERA.contains(place)) for place in places))
+    seen = tuple(np.flatnonzero(CAMERA.contains(place)) for place in places)
+    return replace(model, seen=seen, errors_px=tuple(np.zeros(len(some)) for some in seen))

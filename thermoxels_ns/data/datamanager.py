@@ -143,8 +143,9 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         """Return the cameras of the streams that train: the photographs', and thermal cameras where these differ."""
         dataset, streams = self.train_dataset, self.config.streams
         own = dataset.thermal_cameras is not None
-        kinds = [False] * (streams != "thermal" or not own) + [True] * (streams != "rgb" and own)
-        parts = [dataset.views(thermal) for thermal in kinds]
+        parts = [dataset.views()] if streams != "thermal" or not own else []
+        if streams != "rgb" and own:
+            parts.append(dataset.views(thermal=True))
         return Views(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
 
     def get_train_rays_per_batch(self) -> int:

@@ -55,7 +55,7 @@ def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseT
     folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
     if folder is None:
         if "tracks_file_path" in scene.meta:
-            raise SceneError("it lacks; an earlier version wrote sparse_tracks.npz: capture the scene again")
+            raise SceneError("there is none, as an earlier version captured the scene. Capture the scene again.")
         return None
     cameras, images, points = read_model(scene.folder / folder)
     pairs = matched_names([image.name for image in images.values()], [frame.name for frame in scene.frames])

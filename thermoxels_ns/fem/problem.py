@@ -257,7 +257,7 @@ class HeatProblem:
         """Heat capacity per volume of each tetrahedron, shape (t,), [J / (m3 K)]."""
         return self._of_tets("heat_capacity_j_m3k")
 
-    @property
+    @cached_property
     def materials(self) -> dict[str, Material]:
         """The material of each region that has tetrahedra, by its name."""
         one, used = self.material, [self.mesh.region_names[number] for number in np.unique(self.mesh.region)]

@@ -125,11 +125,13 @@ class RungeKutta:
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.weights[-1]])]
-        exchanged_w = more[0] * system.exchanged_heat(start_k, time_s)
-        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), exchanged_w)
-        difference_w, end_s = exchange_w - more[0] * system.conducted_heat(start_k), time_s + scheme.nodes[-1] * step_s
+        start_w = more[0] * system.exchanged_heat(start_k, time_s)
+        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), start_w)
+        difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
+        end_s = time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
-        return float(np.max(np.abs(equation.damped(difference_w, float(np.sum(exchange_w)), start_k, end_s))))
+        error_k = equation.damped(difference_w, float(np.sum(exchange_w)), start_k, end_s)
+        return float(np.max(np.abs(error_k)))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
         time_s = time_s if self.system.matrix_in_time else 0.0

@@ -200,10 +200,8 @@ class HeatSystem:
 
     def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat flow through each boundary triangle, as if fixed nodes stored nothing, shape (f,), [W]."""
-        total_w, ends = (
-            np.zeros(len(self.problem.mesh.facets)),
-            np.cumsum([len(form.parts) for form in self._every_form]),
-        )
+        total_w = np.zeros(len(self.problem.mesh.facets))
+        ends = np.cumsum([len(form.parts) for form in self._every_form])
         for form, heat_w in zip(self._every_form, np.split(self.every_part_heat_w(relative_k, time_s), ends[:-1])):
             if form.kind != "source":
                 total_w[form.parts] += heat_w

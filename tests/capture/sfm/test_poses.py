@@ -1,5 +1,7 @@
 """Poses and points of a corner whose truth is known; a capture's poses are compared in `test_stages.py`."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -11,7 +13,7 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, image_pairs, read_poses
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.commands.capture import capture_folder
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 
 def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():
@@ -37,6 +39,28 @@ def test_a_mapping_that_fails_is_an_error_and_the_capture_goes_on_behind_its_fea
     monkeypatch.undo()
     with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the mapping
         capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+
+
+def test_a_model_that_a_full_disk_cut_off_is_not_kept(tmp_path, monkeypatch):
+    """COLMAP itself says nothing of it."""
+
+    class Group:
+        points3D = ()
+        num_reg_images = staticmethod(lambda: 3)
+        reg_image_ids = staticmethod(lambda: [1, 2, 3])
+        image = staticmethod(lambda _: SimpleNamespace(name=""))
+
+        @staticmethod
+        def write(folder):
+            write_colmap_model(folder, ["a.jpg"], np.eye(4)[None], CAMERA, np.array([[0.0, 0.0, -2.0]]))
+            (folder / "points3D.bin").write_bytes(b"")
+
+    write_pairs(tmp_path / "card")
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: Group})
+    with pytest.raises(OutputError, match=r"poses: expected to write .* got files that are cut off.*free space"):
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+    kept = tmp_path / "scene" / ".capture" / "poses"
+    assert kept.is_dir() and not (kept / "done").exists() and not (kept / MODEL_FOLDER).exists()
 
 
 def test_a_slanted_plane_has_its_own_depth_and_not_that_of_its_nearest_points() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,13 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.core.arrays import IntArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.data.colmap_model import PARAMETERS, lens_entries, read_model
+from thermoxels_ns.data.colmap_model import PARAMETERS, camera_to_world, lens_entries, read_model
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
@@ -179,41 +179,35 @@ def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> Sfm
     `size` is the original photographs' width and height, from which those for COLMAP may have been reduced. Raises
     `SceneError` for a damaged model.
     """
-    import pycolmap
-
     try:
-        read_model(folder / MODEL_FOLDER)  # pycolmap reads a file that is cut off for ever
+        cameras, images, points = read_model(folder / MODEL_FOLDER)
     except SceneError as problem:
         remedy = "Find the poses again with --from-stage poses."
         raise SceneError("poses", expected="those that were kept", got=problem, remedy=remedy) from problem
-    reconstruction: Any = pycolmap.Reconstruction(folder / MODEL_FOLDER)
-    posed = [reconstruction.images[number] for number in sorted(reconstruction.images)]
-    camera = reconstruction.cameras[posed[0].camera_id]
-    values: dict[str, Any] = lens_entries(camera.model.name, camera.params)
-    found = Camera(int(camera.width), int(camera.height), **values)
-    factor = 0.5 * (size[0] / found.width + size[1] / found.height)
-    ids = sorted(reconstruction.points3D)
-    points = [reconstruction.points3D[i] for i in ids]
-    number = {i: n for n, i in enumerate(ids)}
-    places = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    poses, seen, errors_px = [], [], []
-    for image in posed:
-        poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
-        # A scene point may have two features in one photograph; the first counts.
-        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
-        seen.append(np.array(sorted(own), dtype=np.int64))
-        pixels, world_to_camera = np.array([own[n] for n in seen[-1]]).reshape(-1, 2), image.cam_from_world().matrix()
-        shown = found.project(places[seen[-1]] @ world_to_camera[:, :3].T + world_to_camera[:, 3])
-        errors_px.append(np.linalg.norm(shown - pixels, axis=1) * factor)
-    return SfmModel(
-        tuple(names[int(image.image_id) - 1] for image in posed),
-        found.resized(*size),
-        np.stack(poses),
-        places,
-        np.array([point.error for point in points], dtype=np.float64) * factor,
-        tuple(seen),
-        tuple(errors_px),
+    posed, ids = [images[number] for number in sorted(images)], sorted(points)
+    lens, number = cameras[posed[0].camera_id], {point: row for row, point in enumerate(ids)}
+    values: dict[str, Any] = lens_entries(lens.model, lens.params)
+    camera = Camera(int(lens.width), int(lens.height), **values)
+    factor = 0.5 * (size[0] / camera.width + size[1] / camera.height)
+    model = SfmModel(
+        tuple(names[int(image.id) - 1] for image in posed),
+        camera.resized(*size),
+        np.stack([camera_to_world(image) for image in posed]),
+        np.array([points[point].xyz for point in ids], dtype=np.float64).reshape(-1, 3),
+        np.array([float(points[point].error) for point in ids]) * factor,
+        seen=(),
+        errors_px=(),
     )
+    seen, errors_px = list[IntArray](), list[FloatArray]()
+    for frame, image in enumerate(posed):
+        # A photograph may show a point by two features; the first counts.
+        features = zip(reversed(image.point3D_ids.tolist()), reversed(image.xys))
+        own = {number[point]: pixel for point, pixel in features if point in number}
+        seen.append(np.array(sorted(own), dtype=np.int64))
+        pixels = np.array([own[row] for row in seen[-1].tolist()]).reshape(-1, 2)
+        shown = camera.project(model.in_camera(frame, model.points[seen[-1]]))
+        errors_px.append(np.linalg.norm(shown - pixels, axis=1) * factor)
+    return replace(model, seen=tuple(seen), errors_px=tuple(errors_px))
 
 
 def image_pairs(count: int) -> IntArray:

@@ -28,7 +28,7 @@ class SfmModel:
     points: FloatArray  # scene points, shape (n, 3), in world units
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
     seen: tuple[IntArray, ...]  # indices into `points` of the points that each frame shows, rising
-    errors_px: tuple[FloatArray, ...] = ()
+    errors_px: tuple[FloatArray, ...]
     """Distances of these points' features from their projections in each frame, [pixels of the photographs]."""
 
     @property
