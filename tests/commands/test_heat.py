@@ -50,7 +50,8 @@ PROBES = ["--probes", "0.5", "2", "2", "3.9", "2", "0.1"]
 def folder(tmp_path_factory) -> Path:
     """An exported room, an exported wall, and two scenes."""
     folder = tmp_path_factory.mktemp("heat")
-    for name, mesh in (("room", room()), ("wall", wall())):
+    named = replace(wall(), region_names=("<script>", "slab"))
+    for name, mesh in (("room", room()), ("wall", named)):
         (folder / name).mkdir()
         write_mesh(folder / name / "mesh.vtu", mesh)
     (folder / "hour.yaml").write_text(TRANSIENT)
@@ -84,6 +85,7 @@ def test_the_u_value_of_an_exported_wall(folder, capsys) -> None:
     ]
     page = (folder / "u" / "report.html").read_text()
     assert f"{u:.2f} W/(m" in page and "Nothing was left out" in page
+    assert "&lt;script&gt;" in page and "<script" not in page
     # What the reader asked stands first, how it was solved last.
     assert page.index("W, all by convection on exterior-") < page.index("The inner surface is coldest at")
     assert re.findall(r"<h2>(.*?)</h2>", page) == [

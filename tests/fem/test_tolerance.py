@@ -1,5 +1,6 @@
 import tracemalloc
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -154,8 +155,7 @@ BODIES = {
     "conductivities 1000 apart": bridge,
     "fin": fin,
     "radiating sphere": stove,
-    "side by side, 1e-8": lambda: side_by_side(1e-8),
-    "side by side, 1e8": lambda: side_by_side(1e8),
+    **{f"side by side, {k:g}": partial(side_by_side, k) for k in (1e-8, 0.035, 1e8)},
 }
 
 

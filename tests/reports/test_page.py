@@ -94,7 +94,7 @@ def shown() -> dict[str, Any]:
         "targets": (MET, MISSED),
         "compared": (Compared("door", "W/(m2 K)", 3.6, Interval(4.0, 3.7, 4.2)), Compared("psi", "W/(m K)", 0.7, None)),
         "inputs": [(picture("white", "JPEG"), picture("black", "JPEG"))],
-        "views": [(f"frame_eval_{n}", [picture(c) for c in ("red", "green", "blue", "yellow")]) for n in (1, 2)],
+        "views": [(f"{HOSTILE}{n}", [picture(c) for c in ("red", "green", "blue", "yellow")]) for n in (1, 2)],
         "gradient": ["#000004", "#fcffa4"],
         "ends_c": [10.0, 30.0],
         "night": picture("navy"),
@@ -122,6 +122,7 @@ def test_results_times_and_commands_are_shown(shown) -> None:
     assert re.findall(r"width: ([\d.]+)%\"", text) == ["75.0", "25.0"]
     assert "width: 0.0%" in build_page("demo.html.j2", **shown | {"seconds": [("Train", 0.0)]})
     words = outline.words
+    assert "<script" not in text and f"{HOSTILE}2" in words
     assert "ns-train thermoxels" in words and "ns-eval --load-config 'a b'" in words
     assert "ns-viewer --load-config run/config.yml" in words
     assert "thermoxels heat export/mesh.vtu --scene original" in words

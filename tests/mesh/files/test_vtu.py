@@ -47,7 +47,8 @@ def assert_same(read, written) -> None:
 @pytest.mark.parametrize("name", ["mesh.vtu", "my house.vtu"])
 def test_a_tagged_mesh_comes_back_bit_for_bit(tmp_path, tagged_mesh, name) -> None:
     count = np.random.default_rng(2).integers(0, 9, (len(tagged_mesh.facets), 2))
-    counted = dataclasses.replace(tagged_mesh, boundary=dataclasses.replace(tagged_mesh.boundary, photographs=count))
+    tags = dataclasses.replace(tagged_mesh.boundary, photographs=count)
+    counted = dataclasses.replace(tagged_mesh, boundary=tags, region_names=("a<b>", "floor & slab", "roof"))
     write_mesh(tmp_path / name, counted)
     read = read_mesh(tmp_path / name)
     assert_same(read, counted)

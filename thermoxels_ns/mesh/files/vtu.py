@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
+from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
@@ -58,7 +59,10 @@ def write_vtu(path: Path | str, mesh: TetMesh) -> None:
     """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), body_grid(mesh))
+    grid = body_grid(mesh)
+    for array in map(grid.GetFieldData().GetAbstractArray, range(len(mesh.region_names))):
+        array.SetName(escape(array.GetName()))  # VTK writes names of arrays into its XML as they are
+    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), grid)
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
