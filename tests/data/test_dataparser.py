@@ -88,11 +88,13 @@ def test_train_and_eval_share_world_and_range(scene_folder):
     assert train.metadata["temperature_range"] == evaluate.metadata["temperature_range"] == TemperatureRange(10, 20)
 
 
-def test_temperature_range_from_bounds_even_if_swapped(scene_folder):
+def test_temperature_range_from_bounds_even_if_swapped(scene_folder, capsys):
     scene = scene_folder()
     assert parse(scene.path).metadata["temperature_range"] == TemperatureRange(10.0, 30.0)
+    assert "swapped" not in capsys.readouterr().out
     write_bounds(30.0, 10.0)(scene)
     assert parse(scene.path).metadata["temperature_range"] == TemperatureRange(10.0, 30.0)
+    assert f"the two keys of {BOUNDS_NAME} swapped" in " ".join(capsys.readouterr().out.split())
 
 
 def write_bounds(low, high):

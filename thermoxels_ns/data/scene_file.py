@@ -164,8 +164,10 @@ def read_scene_file(
         remedy = "Pass --thermal-bounds -5 42, for example."
         raise SceneError("thermal_bounds", expected=expected, got=got, remedy=remedy)
     frames.sort(key=lambda frame: frame.name)
-    unit = _unit({} if thermal_bounds else meta, json_path, bounds)
     read = "photographs alone" if alone else f"thermal images {f'in {place}' if there else 'named in the json'}"
+    if bounds and bounds[0] > bounds[1]:  # as in some published scenes
+        bounds, read = (bounds[1], bounds[0]), f"{read}, the two keys of {BOUNDS_NAME} swapped"
+    unit = _unit({} if thermal_bounds else meta, json_path, bounds)
     words = f"{source.layout.name}: poses from {json_path.relative_to(folder).as_posix()}, {read}"
     left_out = [*source.left_out, *left_out]
     return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out, words)
@@ -186,7 +188,7 @@ def _read_bounds(folder: Path) -> tuple[float, float] | None:
         expected = f"{keys[0]} and {keys[1]}, degrees Celsius from absolute zero to {_HOTTEST_C:.0f}"
         remedy = "Correct the file, or remove it if the thermal files hold degrees Celsius."
         raise SceneError(str(path), expected=expected, got=dict(zip(keys, given)), remedy=remedy)
-    return min(bounds), max(bounds)  # some published scenes have the two keys swapped
+    return bounds[0], bounds[1]
 
 
 def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | None) -> ThermalUnit:
