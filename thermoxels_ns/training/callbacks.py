@@ -14,12 +14,11 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from threadpoolctl import threadpool_limits
-from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.refine import RowChange, prune, refine, widen_colour
+from thermoxels_ns.field.refine import GridChange, prune, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
@@ -75,20 +74,16 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             CONSOLE.log(
                 f"step {step}: {air.sum():,} of {len(air):,} voxels are air, or in view of fewer than two photographs"
             )
-            old = model.grid.row_parameters()
-            follow(old, prune(model.grid, ~air))
+            follow(prune(model.grid, ~air))
 
-    def follow(
-        old: dict[str, Parameter], change: RowChange | None, grid: VoxelGrid = model.grid, prefix: str = ""
-    ) -> None:
-        """Give the optimisers the new parameters of `grid` in place of `old`, and change their state by `change`."""
+    def follow(change: GridChange, grid: VoxelGrid = model.grid, prefix: str = "") -> None:
+        """Give the optimisers the new parameters of `grid`, and change their state by `change`."""
         assert attributes.optimizers is not None
-        if change is None:
-            return
         for name, new in grid.row_parameters().items():
-            if new is not old[name]:
+            (old,) = attributes.optimizers.parameters[prefix + name]
+            if new is not old:
                 optimizer: Any = attributes.optimizers.optimizers[prefix + name]
-                optimizer.change_rows(old[name], new, change)
+                optimizer.follow(old, new, change)
                 attributes.optimizers.parameters[prefix + name] = [new]
 
     def change_surroundings(step: int) -> None:
@@ -103,34 +98,30 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
             model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
-        old = grid.row_parameters()
-        follow(old, prune(grid, keep), grid, prefix)
+        follow(prune(grid, keep), grid, prefix)
         if model.seen_surroundings is None:
             CONSOLE.log(f"step {step}: surroundings dropped, all that is outside the box lies at infinity")
             return
         if step in factors:
-            old = grid.row_parameters()
-            follow(old, refine(grid, factors[step]), grid, prefix)
+            follow(refine(grid, factors[step]), grid, prefix)
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
     def change_lattice(step: int) -> None:
-        assert attributes.pipeline is not None and attributes.optimizers is not None
+        assert attributes.pipeline is not None
         datamanager = attributes.pipeline.datamanager
         if step in decisions:
             decide_backdrop(model, datamanager)
         thin = step in model.config.thin_at
         threshold = model.config.thin_threshold if thin else model.config.prune_threshold
         if step in steps and threshold > 0:
-            old = model.grid.row_parameters()
             said, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
-            follow(old, change)
+            follow(change)
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {said}")
         if step in steps:
             change_surroundings(step)
         if step in factors:
-            old = model.grid.row_parameters()
             try:
-                follow(old, model.split(factors[step]))
+                follow(model.split(factors[step]))
             except MemoryBudgetError as problem:
                 if not model.config.voxel_pixels:  # the user gave this resolution
                     raise
@@ -147,14 +138,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def widen(step: int) -> None:
         """Let the grid store all harmonics of colour once their step is reached, and tell the optimiser."""
-        assert attributes.optimizers is not None
-        old, stored, degree = model.grid.sh, model.grid.sh_degree, model.config.sh_degree
+        stored, degree = model.grid.sh_degree, model.config.sh_degree
         if stored is None or degree is None or stored >= degree:
             return
         if int(model.trained_steps) >= model.config.view_dependence_from:
-            change, optimizer = widen_colour(model.grid, degree), attributes.optimizers.optimizers["sh"]
-            optimizer.change_columns(old, model.grid.sh, change)  # type: ignore[attr-defined]
-            attributes.optimizers.parameters["sh"] = [model.grid.sh]  # type: ignore[list-item]
+            follow(widen_colour(model.grid, degree))
 
     early = min(steps | decisions) // 3
     return [
@@ -229,7 +217,7 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     return found
 
 
-def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, RowChange]:
+def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, GridChange]:
     """Drop all voxels but those to which some training ray of either stream gives more than `threshold` of its light.
 
     Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would

@@ -27,7 +27,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
-from thermoxels_ns.field.refine import RowChange, refine
+from thermoxels_ns.field.refine import GridChange, refine
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -158,7 +158,7 @@ class ThermoxelsModel(Model):
             groups |= {f"surroundings_{name}": [parameter] for name, parameter in rows.items()}
         return groups
 
-    def split(self, factor: int) -> RowChange:
+    def split(self, factor: int) -> GridChange:
         """Split every kept voxel into factor^3, log the memory that takes, and return the change of rows.
 
         Raises:
