@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermoxels_ns.core.checks import (
-    check_array,
-    check_positive,
-    remove_file,
-    replace_when_done,
-)
+from thermoxels_ns.core.checks import check_array, check_positive, remove_file, replace_when_done
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.measured import read_measured
