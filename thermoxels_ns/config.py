@@ -11,7 +11,6 @@ from nerfstudio.plugins.types import MethodSpecification
 from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.core.yaml_records import configs_folder, read_yaml, with_overrides
 from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
-from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline, ThermoxelsPipelineConfig
@@ -46,9 +45,7 @@ def _trainer(
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         pipeline=ThermoxelsPipelineConfig(
-            datamanager=ThermalDataManagerConfig(
-                dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=4096, thermal_num_rays_per_batch=2048
-            ),
+            datamanager=ThermalDataManagerConfig(),
             model=ThermoxelsModelConfig(voxel_pixels=VOXEL_PIXELS),
         ),
         optimizers={

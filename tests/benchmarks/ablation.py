@@ -30,7 +30,7 @@ import shutil
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import entry_points
 from operator import attrgetter
@@ -69,8 +69,8 @@ def _without_ends(*given: Any) -> Any:
     """Weights of voxels none of which is kept because rays end in it."""
     from thermoxels_ns.training.ray_statistics import voxel_weights
 
-    weights = voxel_weights(*given)
-    return replace(weights, ends=weights.ends & False)
+    largest, ends = voxel_weights(*given)
+    return largest, ends & False
 
 
 MECHANISMS: Mapping[str, Without] = {

@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermoxels_ns.core.checks import (
-    check_finite,
-    check_positive,
-    check_shape,
-    remove_file,
-    replace_when_done,
-)
+from thermoxels_ns.core.checks import check_array, check_positive, remove_file, replace_when_done
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.measured import read_measured
@@ -29,8 +23,8 @@ def test_impossible_ranges_are_refused(bounds):
 def test_checks_name_what_is_wrong():
     for call in (
         lambda: check_positive("it", -1.0, "Go forward.", MeshError),
-        lambda: check_finite("it", np.array([1.0, np.nan, np.inf]), "Mend it.", MeshError),
-        lambda: check_shape("it", np.zeros((4, 2)), (None, 3), "Transpose it.", MeshError),
+        lambda: check_array("it", np.array([1.0, np.nan, np.inf]), None, "Mend it.", MeshError),
+        lambda: check_array("it", np.zeros((4, 2)), (None, 3), "Transpose it.", MeshError),
     ):
         with pytest.raises(MeshError, match=r"^it: expected"):
             call()

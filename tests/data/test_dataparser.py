@@ -172,14 +172,14 @@ def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_traini
     )
     np.testing.assert_allclose(small, full[:, :24].reshape(6, 3, 8, 3, 3).mean(axis=(1, 3)), atol=2 / 255)
     if thermal_size == (25, 18):  # one ray carries both, so both have the same pixels
-        assert given[1].shares_camera
+        assert given[1].thermal_cameras is None
         blocks = (valid[:, :24].reshape(6, 3, 8, 3), (valid * thermal)[:, :24].reshape(6, 3, 8, 3))
         count, total = (block.sum(axis=(1, 3)) for block in blocks)
         assert {0, 8, 9} == set(count.ravel().tolist())
         np.testing.assert_array_equal(where[..., 0], count > 0)
         np.testing.assert_allclose(averaged[..., 0], total / np.maximum(count, 1), atol=1e-6)
     else:
-        assert not given[1].shares_camera and averaged.shape == thermal.shape
+        assert given[1].thermal_cameras is not None and averaged.shape == thermal.shape
     assert given[1].thermal_report() == given[0].thermal_report() and given[0].thermal_report().startswith("10 of ")
     held_out = parse(scene.path, "val", photographs_gb=room)
     assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["image_scale"] == 1.0

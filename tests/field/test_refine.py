@@ -164,7 +164,7 @@ def test_optimisers_go_on_as_if_the_columns_had_been_there(make, low, high):
         if turn == 3:
             old = narrow.sh
             change = widen_colour(narrow, high)
-            pair[0][1].change_columns(old, narrow.sh, change)
+            pair[0][1].follow(old, narrow.sh, change)
             assert pair[0][1].param_groups[0]["params"] == [narrow.sh] and list(pair[0][1].state) == [narrow.sh]
         rows = (torch.rand(len(wide.sh), generator=generator) < 0.4).nonzero()[:, 0]
         push = torch.randn(len(rows), wide.sh.shape[1], generator=generator)

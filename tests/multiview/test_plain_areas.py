@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop, upwards
-from thermoxels_ns.multiview.differences import Differences
+from thermoxels_ns.multiview.differences import without_gains
 from thermoxels_ns.multiview.evidence import PhotographEvidence
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, feature_rays_to_depths
@@ -95,8 +95,7 @@ def test_a_sky_that_some_photographs_show_overexposed_is_one():
     seen, is_sky = house(sky=(0.9, 0.9, 0.9), wall=(0.5, 0.45, 0.4))
     gain = np.array([1.0, 1.3, 0.8, 0.9, 1.2, 0.95])
     exposed = np.minimum(seen.colours * gain[seen.numbers, None], 1.0).astype(np.float32)
-    differences = Differences(np.log(gain)[:, None].repeat(3, axis=1), np.zeros((6, 3)), np.zeros(6), np.zeros(6))
-    corrected = differences.without_gains(replace(seen, colours=exposed))
+    corrected = without_gains(replace(seen, colours=exposed), np.log(gain)[:, None].repeat(3, axis=1))
     backdrop, bright = found(corrected), gain[seen.numbers] > 1.1
     assert backdrop[is_sky & bright].mean() > 0.8 and backdrop[is_sky & ~bright].mean() > 0.8
     assert not backdrop[~is_sky].any()

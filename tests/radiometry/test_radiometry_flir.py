@@ -95,7 +95,7 @@ def test_counts_beyond_the_calibration_are_no_temperatures(tmp_path):
 def test_training_reads_the_same_degrees_whatever_the_unit(tmp_path, name):
     path = write(tmp_path, FlirFile(smooth_counts()), name)
     expected = read_thermogram(path).temperature_c
-    for unit in (ThermalUnit.celsius(), ThermalUnit.bounds(0.0, 1.0), ThermalUnit.linear(0.1, 0.0)):
+    for unit in (ThermalUnit(), ThermalUnit.bounds(0.0, 1.0), ThermalUnit.linear(0.1, 0.0)):
         np.testing.assert_array_equal(read_thermal_file(path, unit), expected)
 
 

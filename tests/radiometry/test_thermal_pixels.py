@@ -13,7 +13,7 @@ from thermoxels_ns.radiometry.thermogram import read_thermogram
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
 COUNTS = ThermalUnit.linear(0.025, -100.0)
-CELSIUS = ThermalUnit.celsius()
+CELSIUS = ThermalUnit()
 
 
 def save(path: Path, pixels: np.ndarray) -> Path:

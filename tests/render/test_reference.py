@@ -10,7 +10,6 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import reference
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.reference import sample_box
 
 
 def test_renders_are_the_sums_of_the_paper():
@@ -18,10 +17,8 @@ def test_renders_are_the_sums_of_the_paper():
     grid = as_double(random_grid(1, 1, "exp", density=0.0))
     rays = in_double(random_request(grid, 12, mixed=False))
     seen = reference.render(grid, rays, RenderOptions())
-    lo, hi = (torch.tensor(v, dtype=torch.float64) for v in (grid.lattice.lo, grid.lattice.hi))
-    distances, deltas = sample_box(
-        rays.origins, rays.directions, lo, hi, grid.lattice.voxel_size / 2, rays.near, rays.far
-    )
+    marched = reference.march(grid, rays, RenderOptions())
+    distances, deltas = marched.t, marched.deltas
     assert seen.rgb is not None and int((seen.accumulation > 0.1).sum()) > 6
     for r in range(12):
         real = deltas[r] > 0

@@ -45,7 +45,7 @@ def main(resolution: int, share: float) -> None:
         old = grid.row_parameters()
         moved = how()
         for name, new in grid.row_parameters().items():
-            optimizers[name].change_rows(old[name], new, moved)
+            optimizers[name].follow(old[name], new, moved)
 
     def step() -> MemoryNeed:
         wants_rgb = torch.arange(8192) < 4096

@@ -21,7 +21,6 @@ def test_thermal_loss_is_half_l2_half_l1():
     predicted, target = torch.tensor([[0.2], [0.8]]), torch.tensor([[0.0], [0.5]])
     expected = 0.5 * (0.04 + 0.09) / 2 + 0.5 * (0.2 + 0.3) / 2
     assert float(losses.thermal_loss(predicted, target)) == pytest.approx(expected)
-    assert float(losses.thermal_loss(predicted, target, 1.0)) == pytest.approx((0.04 + 0.09) / 2)
 
 
 def test_total_variation_of_a_ramp_is_its_slope():

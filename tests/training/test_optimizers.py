@@ -163,7 +163,7 @@ def test_state_follows_split_and_pruned_rows(kind, change):
     moved = refine(grid, 2) if change == "split" else prune(grid, np.arange(len(grid.voxels)) % 3 == 0)
     for name, new in grid.row_parameters().items():
         optimizer = optimizers[name]
-        optimizer.change_rows(old[name], new, moved)
+        optimizer.follow(old[name], new, moved)
         assert [p for group in optimizer.param_groups for p in group["params"]] == [new]
         assert list(optimizer.state) == [new] and new is not old[name]
         for key, values in optimizer.state[new].items():

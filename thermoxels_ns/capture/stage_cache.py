@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.version import __version__
+from thermoxels_ns.radiometry.decoders import errors_name
 
 CACHE_FOLDER = ".capture"
 _FORMAT = 6  # number of the results' file format; a higher number makes all earlier results invalid
@@ -88,13 +88,8 @@ def save_rig(path: Path, rig: RigEstimate) -> None:
 
 def load_rig(path: Path) -> RigEstimate:
     """Read a rig that `save_rig` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
-    try:
+    with errors_name(path, "what an earlier capture wrote", "Run it with --from-stage rig.", ThermoxelsError):
         with np.load(path, allow_pickle=False) as opened:
             values = {name: opened[name].tolist() if opened[name].ndim < 2 else opened[name] for name in opened.files}
         width, height, *numbers = values["thermal_camera"]
         return RigEstimate(**{**values, "thermal_camera": Camera(int(width), int(height), *numbers)})
-    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as problem:
-        expected, got = "what an earlier capture wrote", str(problem) or type(problem).__name__
-        raise ThermoxelsError(
-            str(path), expected=expected, got=got, remedy="Run it with --from-stage rig."
-        ) from problem

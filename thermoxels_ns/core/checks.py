@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import os
@@ -20,6 +19,8 @@ from filelock import FileLock, Timeout
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+
+_IN_THE_WAY = "Move away what is there, check free space and permissions, or choose another folder."
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -50,27 +51,25 @@ def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]
             raise ThermoxelsError(name.rpartition(".")[2], expected=expected, got=value, remedy=remedy)
 
 
-def check_finite(
-    name: str, array: npt.NDArray, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
-) -> npt.NDArray:
-    """Return `array` if every entry is finite, else raise `error` with the count of bad entries."""
-    bad = int(np.size(array) - np.count_nonzero(np.isfinite(array)))
-    if bad:
-        raise error(name, expected="finite numbers only", got=f"{bad} of {array.size} NaN or infinite", remedy=remedy)
-    return array
-
-
-def check_shape(
+def check_array(
     name: str,
     array: npt.NDArray,
-    shape: Sequence[int | None],
+    shape: Sequence[int | None] | None,
     remedy: str,
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> npt.NDArray:
-    """Return `array` if its shape matches `shape` (None matches any length), else raise `error`."""
-    if len(array.shape) != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
+    """Return `array` if every entry is finite and its shape matches `shape`, else raise `error`.
+
+    None as a length matches any length, None as `shape` any shape.
+    """
+    if shape is not None and (
+        len(array.shape) != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape))
+    ):
         wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
         raise error(name, expected=f"shape {wanted}", got=tuple(array.shape), remedy=remedy)
+    bad = int(np.size(array) - np.count_nonzero(np.isfinite(array)))
+    if bad:
+        raise error(name, expected="finite numbers only", got=f"{bad} of {array.size} NaN or infinite", remedy=remedy)
     return array
 
 
@@ -85,21 +84,39 @@ def check_direction(
     return array / length
 
 
+@contextmanager
+def plain_os_errors(
+    what: Path | str,
+    expected: str = "files that can be read and written",
+    remedy: str = "Check free space, permissions and the length of names.",
+    error: type[ThermoxelsError] = OutputError,
+    always_what: bool = False,
+) -> Iterator[None]:
+    """Turn an OSError of a with block into `error` about `what`, or if the system names a file about that file.
+
+    With `always_what` the error is about `what` in any case, such as where the system names a temporary file.
+    """
+    try:
+        yield
+    except ThermoxelsError:
+        raise
+    except OSError as problem:
+        name = str(what if always_what else problem.filename or what)[:300]
+        got = problem.strerror or str(problem)
+        raise error(name, expected=expected, got=got, remedy=remedy) from problem
+
+
 def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
     """Make the folder `path` if needed and return it.
 
     Raises `OutputError` if no temporary file can be made in the folder, or if fewer than `room_bytes` are free there.
     """
-    folder = Path(path)
-    try:
+    folder, remedy = Path(path), "Choose another folder or change its permissions."
+    expected = f"a folder that can be written to at {folder}"
+    with plain_os_errors("output folder", expected, remedy, always_what=True):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
-    except OSError as problem:
-        expected = f"a folder that can be written to at {folder}"
-        got = problem.strerror or str(problem)
-        remedy = "Choose another folder or change its permissions."
-        raise OutputError("output folder", expected=expected, got=got, remedy=remedy) from problem
     if free < room_bytes:
         expected, got = (
             f"{room_bytes / 1e6:.3g} MB of space for results in {folder}",
@@ -108,29 +125,6 @@ def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
         remedy = "Free space on that disk, or choose another folder."
         raise OutputError("output folder", expected=expected, got=got, remedy=remedy)
     return folder
-
-
-@contextmanager
-def plain_os_errors(
-    what: Path | str,
-    expected: str = "files that can be read and written",
-    remedy: str = "Check free space, permissions and the length of names.",
-    error: type[ThermoxelsError] = OutputError,
-) -> Iterator[None]:
-    """Turn an OSError of a with block into `error`, about the file that the system names, or else about `what`."""
-    try:
-        yield
-    except ThermoxelsError:
-        raise
-    except OSError as problem:
-        name, got = str(problem.filename or what)[:300], problem.strerror or str(problem)
-        raise error(name, expected=expected, got=got, remedy=remedy) from problem
-
-
-def remedy_of(problem: Exception, remedy: str) -> str:
-    """Return `remedy` for an error of reading a file, or advice on permissions if the system refused."""
-    refused = isinstance(problem, OSError) and problem.errno not in (None, errno.ENOENT)
-    return "Check its permissions and the disk, or copy it again." if refused else remedy
 
 
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
@@ -165,12 +159,9 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.part{final.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, final)
-    except ThermoxelsError:
-        raise
-    except OSError as problem:
-        raise _output_error(final, "a file that can be written", problem) from problem
+        with plain_os_errors(final.name, f"a file that can be written at {final}", _IN_THE_WAY, always_what=True):
+            yield temporary
+            os.replace(temporary, final)
     finally:
         # An error of the block says more than an error of removing the temporary file.
         with suppress(OSError):
@@ -190,10 +181,9 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def remove_file(path: Path | str) -> None:
     """Remove a file if it exists, or raise `OutputError` if that fails."""
-    try:
-        Path(path).unlink(missing_ok=True)
-    except OSError as problem:
-        raise _output_error(Path(path), "a file that can be removed", problem) from problem
+    file = Path(path)
+    with plain_os_errors(file.name, f"a file that can be removed at {file}", _IN_THE_WAY, always_what=True):
+        file.unlink(missing_ok=True)
 
 
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
@@ -226,12 +216,3 @@ def result_folder(path: Path | str, files: Sequence[str], first: str, series: st
         remedy = "Choose another folder with --output-dir, or move them away."
         raise OutputError("output folder", expected=expected, got=", ".join(found), remedy=remedy)
     return folder
-
-
-def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:
-    return OutputError(
-        path.name,
-        expected=f"{expected} at {path}",
-        got=problem.strerror or str(problem),
-        remedy="Move away what is there, check free space and permissions, or choose another folder.",
-    )

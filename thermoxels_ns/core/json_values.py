@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.checks import remedy_of, replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
 
 
@@ -42,9 +42,9 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
     raise error(name, expected=expected, got=got, remedy="Convert it before writing.")
 
 
-def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
-    """Write `plain_values(content)` to a json file; raises `error` for bad values, `OutputError` if writing fails."""
-    text = json.dumps(plain_values(content, path.stem, error), indent=1, ensure_ascii=False, allow_nan=False)
+def write_json(path: Path, content: Any) -> None:
+    """Write `plain_values(content)` to a json file; raises `OutputError` if writing fails."""
+    text = json.dumps(plain_values(content, path.stem), indent=1, ensure_ascii=False, allow_nan=False)
     with replace_when_done(path) as temporary:
         # Names of files that are not UTF-8 hold surrogates, which are then written as json escapes them.
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
@@ -61,7 +61,7 @@ def read_json(
         return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:
         if isinstance(problem, OSError) and path.exists():
-            expected, remedy = "a file that can be read", remedy_of(problem, remedy)
+            expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
         raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
 
 

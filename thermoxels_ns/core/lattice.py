@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
 
 CORNER_OFFSETS: IntArray = np.array(
@@ -110,11 +110,11 @@ def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
     array([1., 0., 2., 1.])
     """
     remedy = "The checkpoint's dataparser is damaged; train again."
-    matrix = check_shape("dataparser_transform", np.asarray(transform, np.float64), (3, 4), remedy, CheckpointError)
+    matrix = check_array("dataparser_transform", np.asarray(transform, np.float64), (3, 4), remedy, CheckpointError)
     rotation, shift = matrix[:, :3], matrix[:, 3]
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-    if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
-        expected, got = "a rotation, a finite shift and a scale above 0", f"{matrix.tolist()}, scale {scale}"
+    if not (orthonormal and np.isfinite(scale) and scale > 0):
+        expected, got = "a rotation and a scale above 0", f"{matrix.tolist()}, scale {scale}"
         raise CheckpointError("dataparser_transform", expected=expected, got=got, remedy=remedy)
     inverse = np.eye(4)
     inverse[:3, :3] = np.linalg.inv(rotation) / scale

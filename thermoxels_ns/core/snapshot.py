@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 
@@ -140,8 +140,7 @@ class GridSnapshot:
             if array is None:
                 continue
             named, remedy = f"grid snapshot {name}", _CAMERAS if part is views else _FIELD
-            check_shape(named, array, shape, remedy, MeshError)
-            check_finite(named, array, remedy, MeshError)
+            check_array(named, array, shape, remedy, MeshError)
             if array.size and not least <= array.min() <= array.max() <= most:
                 expected, got = f"values from {least:g} to {most:g}", f"{array.min():g} to {array.max():g}"
                 raise MeshError(named, expected=expected, got=got, remedy=remedy)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import remedy_of
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.radiometry.decoders import errors_name
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
@@ -41,14 +40,10 @@ def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, 
     from nerfstudio.data.utils import colmap_parsing_utils  # only needed here
 
     kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-    try:
+    remedy = "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0."
+    with errors_name(folder, "a COLMAP model (cameras, images, points3D as .bin or .txt) that can be read", remedy):
         model: Any = colmap_parsing_utils.read_model(str(folder), kind)
-    except Exception as problem:  # a damaged file raises struct.error, KeyError, ValueError, MemoryError and others
-        expected = "a COLMAP model (cameras, images, points3D as .bin or .txt)"
-        got = f"one that cannot be read: {str(problem).strip() or repr(problem)}"
-        remedy = remedy_of(problem, "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0.")
-        raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem
-    return model
+        return model
 
 
 def camera_to_world(image: Any) -> FloatArray:

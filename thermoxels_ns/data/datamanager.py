@@ -74,13 +74,13 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         self.train_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.train_num_rays_per_batch).setup()
         self.train_rays.load()
         dataset = self.train_dataset
-        temperatures = dataset.temperature_range
+        temperatures, shared = dataset.temperature_range, dataset.thermal_cameras is None
         if temperatures is None:
             CONSOLE.print(f"Training split: {len(dataset)} photographs alone: the mesh will have no temperatures.")
             return
         CONSOLE.print(
             f"Training split: {len(dataset)} pairs ("
-            + ("one ray carries colour and temperature" if dataset.shares_camera else "thermal cameras of their own")
+            + ("one ray carries colour and temperature" if shared else "thermal cameras of their own")
             + f"), {temperatures.min_c:.2f} to {temperatures.max_c:.2f} C; thermal: {dataset.thermal_report()}."
         )
 
@@ -150,7 +150,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
 
     def get_train_rays_per_batch(self) -> int:
         """Return the number of rays in a batch of `next_train`."""
-        thermal = 0 if self.train_dataset.shares_camera else self.config.thermal_num_rays_per_batch
+        thermal = 0 if self.train_dataset.thermal_cameras is None else self.config.thermal_num_rays_per_batch
         rgb = self._rgb_rays()
         return {"both": rgb + thermal, "rgb": rgb, "thermal": thermal or rgb}[self.config.streams]
 

@@ -41,17 +41,13 @@ class ThermalDataset(InputDataset):
             remedy = "Write: ns-train thermoxels thermal-data --data SCENE."
             raise SceneError("dataparser", expected=expected, got="one that gives photographs only", remedy=remedy)
         self.temperature_range: TemperatureRange | None = self.metadata["temperature_range"]
+        # None: photographs and thermal images share cameras, so that one ray carries a colour and a temperature.
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
             # `scale_factor` changes the resolution of the photographs, not of the thermal images.
             self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
         self._thermal: dict[int, tuple[Tensor, Tensor]] = {}
         self._masked = dict[int, tuple[int, int]]()  # Masked and all pixels of a thermal image
-
-    @property
-    def shares_camera(self) -> bool:
-        """True if photographs and thermal images share cameras, so that one ray carries a colour and a temperature."""
-        return self.thermal_cameras is None
 
     def camera(self, image_idx: int, thermal: bool = False) -> Camera:
         """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`."""

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
-from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.tracks import SparseTracks
+from thermoxels_ns.radiometry.decoders import errors_name
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
@@ -213,10 +213,6 @@ def _read_ply(path: Path) -> FloatArray:
 
     if not path.is_file():
         raise SceneError("ply_file_path", expected=f"a file at {path}", got="nothing there", remedy=_REMEDY)
-    try:
+    with errors_name(path, "a readable .ply", _REMEDY):  # trimesh raises whatever its parsers meet
         loaded: Any = trimesh.load(path)
-        points = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-    except Exception as problem:  # trimesh raises whatever its parsers meet
-        remedy = remedy_of(problem, _REMEDY)
-        raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=remedy) from problem
-    return points
+        return np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)

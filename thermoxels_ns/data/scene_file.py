@@ -16,7 +16,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName, find_source
-from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.data.scene_scale import scale_from_scene_file
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_intrinsics, read_pose
 from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUnit
@@ -156,8 +156,7 @@ def read_scene_file(
         expected, got = "a mask for every frame or for none", f"{masks} masks for {len(frames)} frames"
         remedy = "Add the missing ones (white: use the pixel)."
         raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
-    scale_from_scene_file(meta)
-    up_from_scene_file(meta)
+    scale_from_scene_file(meta)  # raises for a wrong scale, and for a wrong direction up
     bounds = _read_bounds(folder) if thermal_bounds is None else thermal_bounds
     if thermal_bounds is not None and not -ZERO_CELSIUS_K <= thermal_bounds[0] < thermal_bounds[1] <= _HOTTEST_C:
         expected, got = "degrees Celsius of black and, higher, of white", "{:g} and {:g}".format(*thermal_bounds)
@@ -202,7 +201,7 @@ def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | N
         except (KeyError, TypeError, ValueError, OverflowError) as problem:
             expected, where = "numbers celsius_per_count (not 0) and celsius_offset", f"{json_path.name}: thermal_unit"
             raise SceneError(where, expected=expected, got=unit, remedy="Correct the json.") from problem
-    return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()
+    return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit()
 
 
 def _frame(

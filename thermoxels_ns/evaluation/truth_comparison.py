@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
@@ -128,7 +128,7 @@ class KnownTruth:
             tolerance_m: Distance up to which surfaces agree, above 0, [m].
             within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
         """
-        cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
+        cells = check_array("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
         views = self.views(world_to_truth)
         solid = cells | cavities(cells, camera_voxels(cells, lattice, views))[0]
         corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)

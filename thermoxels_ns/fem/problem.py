@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
+from thermoxels_ns.core.checks import check_array, check_direction
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import raising, record
@@ -291,8 +291,7 @@ class HeatProblem:
         if self.initial_temperature_c is None and not self.mesh.has_temperatures:
             remedy = "Add initial: {temperature_c: 15} to the scene, for example: photographs alone tell none."
             raise HeatError(name, expected="temperatures at the start", got="a mesh without", remedy=remedy)
-        start = check_shape(name, self.start_c, (len(self.mesh.points_m),), remedy, HeatError)
-        check_finite(name, start, remedy, HeatError)
+        start = check_array(name, self.start_c, (len(self.mesh.points_m),), remedy, HeatError)
         if start.min() < -ZERO_CELSIUS_K:
             expected = f"temperatures above absolute zero ({-ZERO_CELSIUS_K} C)"
             raise HeatError(name, expected=expected, got=f"{start.min():.6g} C", remedy=remedy)

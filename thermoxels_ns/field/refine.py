@@ -14,10 +14,8 @@ from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
-RowChange = Callable[[Tensor], Tensor]
-"""A function from values per row before a change, (old rows, channels), to values after it, (new rows, channels)."""
-ColumnChange = Callable[[Tensor], Tensor]
-"""A function from values before a change, (rows, old columns), to values after it, (rows, new columns)."""
+GridChange = Callable[[Tensor], Tensor]
+"""A function from values before a change, (old rows, old columns), to values after it, (new rows, new columns)."""
 ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once, which limits the memory for corner numbers and weights
 
 
@@ -54,7 +52,7 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
 
 
 @torch.no_grad()
-def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
+def refine(grid: VoxelGrid, factor: int = 2) -> GridChange:
     """Split every kept voxel of `grid` into factor^3, in place; return the interpolation from old rows to new rows.
 
     The field stays as it is: new corners get interpolated raw values, and corners of before keep their exact values.
@@ -75,7 +73,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 
 
 @torch.no_grad()
-def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
+def prune(grid: VoxelGrid, keep: BoolArray) -> GridChange:
     """Drop voxels of `grid` where `keep` (voxels,) is False, in place; return the function that picks the rows kept."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
@@ -89,15 +87,17 @@ def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
 
 
 @torch.no_grad()
-def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
+def widen_colour(grid: VoxelGrid, degree: int) -> GridChange:
     """Let `grid` store colour up to a higher degree, in place; return the function that adds columns of zeros.
 
-    The field stays as it is, because harmonics with coefficient 0 add nothing.
+    The field stays as it is, because harmonics with coefficient 0 add nothing. One number per row stays as it is.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
     few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)
 
     def change(values: Tensor) -> Tensor:
+        if values.shape[1] == 1:
+            return values
         wide = values.new_zeros((len(values), 3, many))
         wide[..., :few] = values.view(len(values), 3, few)
         return wide.view(len(values), 3 * many)

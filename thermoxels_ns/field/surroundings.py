@@ -59,18 +59,14 @@ class Surroundings(nn.Module):
         lattice = Lattice((0.0, 0.0, 0.0), 1.0, (6 * (deep + 1), across + 1, across + 1))
         self.grid = VoxelGrid(lattice, 0 if colour else None, 0, start_density, activation)
         layer = np.arange(np.prod(lattice.cell_shape)) // (across * across) % (deep + 1)
-        self.keep(layer < deep)
+        voxels = KeptVoxels(lattice, np.flatnonzero(layer < deep))
+        rows = {name: values.data[: voxels.num_rows] for name, values in self.grid.row_parameters().items()}
+        self.grid.replace_voxels(voxels, rows, keep_identity=True)
 
     @property
     def step(self) -> float:
         """Change of 1/q across a voxel, where 1/q falls from 1 on a face of the box to 0 at infinity."""
         return self.grid.lattice.voxel_size / self.deep
-
-    def keep(self, chosen: np.ndarray) -> None:
-        """Drop the voxels that are False in `chosen`, one boolean per voxel of the lattice; only before a training."""
-        voxels = KeptVoxels(self.grid.lattice, np.flatnonzero(chosen))
-        rows = {name: values.data[: voxels.num_rows] for name, values in self.grid.row_parameters().items()}
-        self.grid.replace_voxels(voxels, rows, keep_identity=True)
 
     def segments(
         self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"] | None = None

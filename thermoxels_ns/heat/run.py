@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.core.units import kelvin_to_celsius
@@ -68,8 +68,7 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     [2.0]
     """
     remedy = "Give three coordinates in metres for each probe."
-    points = check_shape("probes", np.asarray(points_m, dtype=np.float64), (None, 3), remedy, HeatError)
-    check_finite("probes", points, remedy, HeatError)
+    points = check_array("probes", np.asarray(points_m, dtype=np.float64), (None, 3), remedy, HeatError)
     corner = mesh.points_m[mesh.tets]
     low, high = corner.min(axis=1), corner.max(axis=1)
     slack = _OUTSIDE * float(np.max(high - low))

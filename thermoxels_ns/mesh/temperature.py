@@ -9,7 +9,7 @@ from scipy.sparse.linalg import cg
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
@@ -82,7 +82,7 @@ def extend_harmonically(
     observed = np.asarray(observed, dtype=bool)
     temperature = np.where(observed, np.asarray(temperature_c, dtype=np.float64), 0.0)
     remedy = "The checkpoint is damaged; resume from an earlier one."
-    check_finite("observed temperatures", temperature, remedy, MeshError)
+    check_array("observed temperatures", temperature, None, remedy, MeshError)
     if observed.all():
         return temperature
     if not observed.any():

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError
 
 FACET_SURFACE = 0  # boundary between solid and empty space
@@ -97,8 +97,7 @@ class TetMesh:
                 expected = "at least one name, all different, of printable characters without a double quote"
                 raise MeshError(f"{name} {what}", expected=expected, got=list(entries), remedy="Rename them.")
         for what, array, shape, below in arrays:
-            values = check_shape(f"{name} {what}", np.asarray(array), shape, remedy, MeshError)
-            check_finite(f"{name} {what}", values, remedy, MeshError)
+            values = check_array(f"{name} {what}", np.asarray(array), shape, remedy, MeshError)
             low, high = (values.min(), values.max()) if values.size else (0, -1)
             if below is not None and not (np.issubdtype(values.dtype, np.integer) and low >= 0 and high < below):
                 expected, got = f"whole numbers from 0 to {below - 1}", f"{low} to {high} ({values.dtype})"

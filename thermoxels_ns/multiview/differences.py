@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,23 +23,11 @@ FREE = 10.0  # Standard error given to a value that is not known
 _ROUNDS, _HUBER = 5, 2.0  # Rounds of robust least squares; a pair off by more standard errors than this counts less
 
 
-@dataclass(frozen=True, eq=False)
-class Differences:
-    """Gains and temperature offsets of photographs relative to their mean, which is 0, with standard errors."""
-
-    log_gain: FloatArray  # Natural logarithm of the gain of each channel, (photographs, 3)
-    log_gain_error: FloatArray  # Standard error of `log_gain`, (photographs, 3)
-    offset: FloatArray  # Offset of normalised temperature, (photographs,)
-    offset_error: FloatArray  # Standard error of `offset`, (photographs,)
-
-    def without_gains(self, photographs: Photographs) -> Photographs:
-        """Return the photographs with colours divided by their gains; `measured` keeps the colours as they were."""
-        gain = np.exp(self.log_gain).astype(np.float32)[photographs.numbers]
-        return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
-
-    def without_offsets(self, photographs: Photographs) -> Photographs:
-        """Return the photographs with the offsets subtracted from normalised temperatures."""
-        return replace(photographs, thermal=photographs.thermal - self.offset.astype(np.float32)[photographs.numbers])
+def without_gains(photographs: Photographs, log_gain: FloatArray) -> Photographs:
+    """Return the photographs with colours divided by the gains exp(`log_gain`), (photographs, 3); `measured` keeps
+    the colours as they were."""
+    gain = np.exp(log_gain).astype(np.float32)[photographs.numbers]
+    return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
 
 
 def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
@@ -51,8 +39,11 @@ def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
     return size > max(least, SURE * doubt)
 
 
-def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences:
-    """Return the gains and offsets of photographs, from points at which two photographs have found the same depth.
+def photograph_differences(depths: Depths, thermal: Float32Array) -> tuple[FloatArray, FloatArray]:
+    """Return how photographs differ, from points at which two photographs have found the same depth, (photographs, 4).
+
+    Columns 0 to 2 are the natural logarithms of the gains of the channels, column 3 the offset of normalised
+    temperature, each relative to its mean over the photographs; the second array holds their standard errors.
 
     For two photographs a and b, the median of ln(a / b) over shared pixels is the difference of their log gains, and
     the median difference of temperatures that of their offsets. All pairs together are solved by weighted least
@@ -106,7 +97,7 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences
         pairs, off, weights = np.array(rows), np.array(seen), np.array(weight)
         for channel in range(4):
             solved[:, channel], error[:, channel] = _solve(pairs, off[:, channel], weights[:, channel], count)
-    return Differences(solved[:, :3], error[:, :3], solved[:, 3], error[:, 3])
+    return solved, error
 
 
 def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.multiview.differences import matters, photograph_differences
+from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
 from thermoxels_ns.multiview.stereo import (
     Depths,
@@ -111,13 +111,15 @@ def evidence_of_photographs(
     far = np.float32(BEYOND * np.linalg.norm(np.subtract(hi, lo)))
     thermal = thermal_at(dataset, photographs, np.where(np.isnan(depths.depth), far, depths.depth))
     photographs = replace(photographs, thermal=thermal)
-    found = photograph_differences(depths, thermal) if gains or offsets else None
     log_gain = offset = None
-    if gains and found is not None and matters(found.log_gain, found.log_gain_error, LEAST_GAIN):
-        log_gain, photographs = found.log_gain, found.without_gains(photographs)
+    found, error = photograph_differences(depths, thermal) if gains or offsets else 2 * (np.zeros((0, 4)),)
+    if gains and matters(found[:, :3], error[:, :3], LEAST_GAIN):
+        log_gain = found[:, :3]
+        photographs = without_gains(photographs, log_gain)
         say(f"photographs differ in brightness and white balance by {np.std(log_gain):.1%}: corrected")
-    if offsets and found is not None and matters(found.offset, found.offset_error, LEAST_OFFSET_K / span_k):
-        offset, photographs = found.offset, found.without_offsets(photographs)
+    if offsets and matters(found[:, 3], error[:, 3], LEAST_OFFSET_K / span_k):
+        offset = found[:, 3]
+        photographs = replace(photographs, thermal=thermal - offset.astype(np.float32)[photographs.numbers])
         say(f"thermal images are offset against each other by {np.std(offset) * span_k:.2f} K: corrected")
     depths, backdrop, ceiling = depths_before_backdrop(replace(depths, photographs=photographs))
     plain = f"a plain {'ceiling' if ceiling.any() else 'backdrop'} fills {np.mean(backdrop | ceiling):.1%}"

@@ -61,9 +61,9 @@ _COUNTS_REMEDY = (
 
 @dataclass(frozen=True)
 class ThermalUnit:
-    """Conversion of a thermal file's numbers to degrees Celsius, made by `bounds`, `linear` or `celsius`."""
+    """Conversion of a thermal file's numbers, by default degrees Celsius, made by `bounds` or `linear` if others."""
 
-    kind: Literal["bounds", "linear", "celsius"]
+    kind: Literal["bounds", "linear", "celsius"] = "celsius"
     """bounds: counts span min to max; linear: counts times a factor plus an offset; celsius: no conversion."""
     scale: float = 1.0  # bounds: max minus min, [K]; linear: [K per count]
     offset_c: float = 0.0  # temperature of count zero, [degrees Celsius]
@@ -84,11 +84,6 @@ class ThermalUnit:
     def linear(cls, celsius_per_count: float, celsius_offset: float) -> ThermalUnit:
         """Return a unit with temperature = count * `celsius_per_count` + `celsius_offset`, [degrees C]."""
         return cls("linear", scale=celsius_per_count, offset_c=celsius_offset)
-
-    @classmethod
-    def celsius(cls) -> ThermalUnit:
-        """Return the unit of files that hold degrees Celsius."""
-        return cls("celsius")
 
 
 def detect_format(path: Path) -> ThermalFormat:

@@ -117,7 +117,10 @@ def _read_stored(
     path: Path, found: ThermalFormat, options: RadiometryOptions
 ) -> tuple[Float32Array, ThermogramMetadata]:
     """Read a file of apparent temperatures or of counts linear in temperature; correct for the user's conditions."""
-    unit, camera, picture = _given_unit(options), None, found in ("TIFF", "PNG")
+    camera, picture = None, found in ("TIFF", "PNG")
+    unit = None if options.camera is None else COUNT_SCALES[options.camera][0]
+    if options.celsius_per_count is not None and options.celsius_offset is not None:
+        unit = ThermalUnit.linear(options.celsius_per_count, options.celsius_offset)
     if picture and size_of_double_tiff(path) is None:
         with Image.open(path) as image:
             check_thermal_size(path, *image.size)
@@ -135,7 +138,7 @@ def _read_stored(
                 got = f"counts of {camera or 'an unnamed camera'}, which may mean several things"
                 raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
             unit = COUNT_SCALES[preset][0]
-    unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
+    unit = ThermalUnit() if unit is None or found == "CSV" else unit
     temperature_c = read_thermal_file(path, unit)
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if picture and unit.kind == "linear" else None
@@ -143,10 +146,3 @@ def _read_stored(
     if conditions != Conditions():
         temperature_c = corrected_temperature_c(temperature_c, conditions)
     return temperature_c, metadata
-
-
-def _given_unit(options: RadiometryOptions) -> ThermalUnit | None:
-    """Return the unit of counts from the user's scale or camera preset; None if neither is given."""
-    if options.celsius_per_count is not None and options.celsius_offset is not None:
-        return ThermalUnit.linear(options.celsius_per_count, options.celsius_offset)
-    return COUNT_SCALES[options.camera][0] if options.camera is not None else None

@@ -43,29 +43,6 @@ def intersect_box(
     return torch.where(hit, t_enter, zero), torch.where(hit, t_leave, zero), hit
 
 
-def sample_box(
-    origins: Float[Tensor, "rays 3"],
-    directions: Float[Tensor, "rays 3"],
-    lo: Float[Tensor, " 3"],
-    hi: Float[Tensor, " 3"],
-    step: float,
-    near: float | Float[Tensor, " rays"] = 0.0,
-    far: Float[Tensor, " rays"] | None = None,
-) -> tuple[Float[Tensor, "rays steps"], Float[Tensor, "rays steps"]]:
-    """Cut the part of each ray inside the box into steps of length `step`; the last step may be shorter.
-
-    Returns:
-        Distance from the ray origin to the middle of each step, and length of each step, world units. Rays are padded
-        with steps of length 0; the lengths of a ray sum to its length inside the box.
-    """
-    t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near, far)
-    length = t_leave - t_enter
-    num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)
-    starts = torch.arange(num_steps, dtype=origins.dtype, device=origins.device) * step
-    deltas = torch.clamp(length[:, None] - starts, min=0.0, max=step)
-    return t_enter[:, None] + starts + 0.5 * deltas, deltas
-
-
 OPAQUE_OPTICAL_DEPTH = 100.0
 """Largest optical depth of one step; light behind it is exp(-100): 4e-44, below the normal numbers of float32."""
 SMALLEST_VARIATION = 1e-10  # Number added under the root of the total variation to keep its gradient finite
@@ -116,10 +93,13 @@ def ray_distortion(
 
 @dataclass(frozen=True)
 class Marched:
-    """Samples of rays through the box, one in the middle of each step, with their weights."""
+    """Samples of rays through the box, one in the middle of each step, with their weights.
+
+    The lengths of a ray's steps sum to its length inside the box; shorter rays are padded with steps of length 0.
+    """
 
     t: Float[Tensor, "rays steps"]  # Distance of each sample from the ray origin, world units
-    deltas: Float[Tensor, "rays steps"]  # Length of each step, world units; 0 for padding
+    deltas: Float[Tensor, "rays steps"]  # Length of each step, world units
     weights: Float[Tensor, "rays steps"]  # Share of its ray's light that ends in each step
     optical_depth: Float[Tensor, " rays"]  # exp(-optical_depth) is the share of light behind the last step
     active: Int64[Tensor, " n"]  # Flat indices (into rays x steps) of the samples in kept voxels, ascending
@@ -133,7 +113,12 @@ def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
     step = lattice.voxel_size / options.steps_per_voxel
-    t, deltas = sample_box(origins, directions, lo, hi, step, request.near, request.far)
+    t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, request.near, request.far)
+    length = t_leave - t_enter
+    num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)
+    starts = torch.arange(num_steps, dtype=origins.dtype, device=origins.device) * step
+    deltas = torch.clamp(length[:, None] - starts, min=0.0, max=step)  # the last step of a ray may be shorter
+    t = t_enter[:, None] + starts + 0.5 * deltas
     active = (deltas > 0).flatten().nonzero()[:, 0]
     ray = active // t.shape[1]
     positions = origins[ray] + directions[ray] * t.flatten()[active][:, None]

@@ -438,13 +438,11 @@ def street() -> SyntheticScene:
 def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
     """Return a scene of a front, 10.4 m wide and 7.6 m high, past which three lines of cameras lead."""
     plan = Plan(np.random.default_rng(8))
-    glass_paint = Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror)
-    ground_paint, stone_paint = Paint((0.46, 0.45, 0.42), 0.26), Paint((0.58, 0.55, 0.50), 0.22)
     paints = (
         wall,
-        ground_paint,
-        stone_paint,
-        glass_paint,
+        Paint((0.46, 0.45, 0.42), 0.26),
+        Paint((0.58, 0.55, 0.50), 0.22),
+        Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror),
         Paint((0.42, 0.24, 0.16), 0.2),
         Paint((0.30, 0.32, 0.34), 0.1),
     )
@@ -504,12 +502,8 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "facade": facade,
     "street": street,
 }
-DEVELOPMENT_NAMES = (
-    "wall-object",
-    "living-room",
-    "facade",
-    "street",
-)  # names of hand-drawn scenes that are hard, for development
+DEVELOPMENT_NAMES = ("wall-object", "living-room", "facade", "street")
+"""Names of hand-drawn scenes that are hard, for development."""
 SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
 """Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
 

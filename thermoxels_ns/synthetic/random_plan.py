@@ -21,7 +21,6 @@ from thermoxels_ns.synthetic.solids import (
     box_beside,
     box_between,
     distance_to_box,
-    fade_towards,
 )
 
 Shape = Box | Sphere | Cylinder
@@ -185,7 +184,8 @@ class Plan:
     def add_glows(self, values: FloatArray, points: FloatArray) -> None:
         """Blend the glows into values of warmth, or of temperature, (n,) at points (n, 3), in place."""
         for glow in self.glows:
-            fade_towards(values, points, glow.core, glow.warmth, glow.reach)
+            near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
+            values += (glow.warmth - values) * near * near * (3.0 - 2.0 * near)
 
 
 def bounds_of(shape: Shape) -> Box:

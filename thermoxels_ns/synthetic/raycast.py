@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.solids import first_hits
 
 _VISIBLE_TOLERANCE = 1e-7
 _GRAZING_COSINE = 1e-6
@@ -51,7 +52,7 @@ def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatA
     Returns:
         Distances (n,) in lengths of the directions, infinite for no surface, and whether it is the scene's solid (n,).
     """
-    distance, _, body = _first_hits(scene, origins, directions)
+    distance, _, body = first_hits([body.solid for body in scene.bodies], origins, directions)
     return distance, body == 0
 
 
@@ -80,16 +81,6 @@ def visible_surface_points(
     return views >= min_views
 
 
-def _first_hits(
-    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return distance (n,), normal (n, 3) and number in `scene.bodies` (n,) of what rays first meet; -1: nothing."""
-    distance, normal = map(np.array, zip(*(body.solid.intersect(origins, directions) for body in scene.bodies)))
-    first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
-    nearest = distance[first, every]
-    return nearest, normal[first, every], np.where(np.isfinite(nearest), first, -1)
-
-
 def _look(
     scene: SyntheticScene, origins: FloatArray, directions: FloatArray, mirrors: bool = True
 ) -> tuple[Float32Array, FloatArray]:
@@ -98,10 +89,11 @@ def _look(
     With `mirrors`, mirroring surfaces blend in the colour along the reflected ray; along it no surface mirrors again.
     """
     rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
+    solids = [body.solid for body in scene.bodies]
     for start in range(0, len(directions), _RAYS_AT_ONCE):
         part = slice(start, start + _RAYS_AT_ONCE)
         origin, ray = np.broadcast_to(origins, directions.shape)[part], directions[part]
-        distance, normal, first = _first_hits(scene, origin, ray)
+        distance, normal, first = first_hits(solids, origin, ray)
         for number, body in enumerate(scene.bodies):
             met = np.flatnonzero(first == number)
             points, normals = origin[met] + distance[met, None] * ray[met], normal[met]

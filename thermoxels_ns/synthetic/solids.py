@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
@@ -271,9 +271,7 @@ class SolidUnion(Solid):
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
-        distance, normal = map(np.array, zip(*(part.intersect(origins, directions) for part in self.parts)))
-        first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
-        return distance[first, every], normal[first, every]
+        return first_hits(self.parts, origins, directions)[:2]
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
@@ -283,6 +281,16 @@ class SolidUnion(Solid):
         drawn = zip(*(part.surface_points(int(share), own_seed) for own_seed, (part, share) in parts))
         points, normals = map(np.concatenate, drawn)
         return points, normals
+
+
+def first_hits(
+    solids: Sequence[Solid], origins: npt.ArrayLike, directions: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return distance (n,), normal (n, 3) and number of the solid (n,; -1: none) that rays meet first: see `Solid`."""
+    distance, normal = map(np.array, zip(*(solid.intersect(origins, directions) for solid in solids)))
+    first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
+    nearest = distance[first, every]
+    return nearest, normal[first, every], np.where(np.isfinite(nearest), first, -1)
 
 
 def box_between(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:
@@ -307,12 +315,6 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
     points = np.asarray(points, dtype=np.float64)
     gap = points - np.clip(points, np.asarray(lo, dtype=np.float64), np.asarray(hi, dtype=np.float64))
     return np.sqrt(np.einsum("ij,ij->i", gap, gap))
-
-
-def fade_towards(values: FloatArray, points: FloatArray, core: Box, value: float, reach: float) -> None:
-    """Set values (n,) at points (n, 3) to `value` inside the box `core`, in place, and blend within `reach` around."""
-    near = np.maximum(1.0 - distance_to_box(points, *core) / reach, 0.0)
-    values += (value - values) * near * near * (3.0 - 2.0 * near)
 
 
 def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

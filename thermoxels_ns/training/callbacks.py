@@ -14,15 +14,15 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from threadpoolctl import threadpool_limits
-from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
-from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureRays
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.refine import RowChange, prune, refine, widen_colour
+from thermoxels_ns.field.kept_voxels import check_memory
+from thermoxels_ns.field.refine import GridChange, prune, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
-from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
+from thermoxels_ns.multiview.evidence import evidence_of_photographs
 from thermoxels_ns.multiview.votes import air_voxels, hardly_shown
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import ThermoxelsModel
@@ -44,7 +44,7 @@ SHORTEST_RUN_WITH_DEPTHS = 400
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """Return the callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    evidence = follow_depths(model, attributes)
+    rays = follow_depths(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
     end, told = None, list[TrainingCallback]()
@@ -60,13 +60,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def carve(step: int) -> None:
         """Drop the voxels of the box that are air, see `ThermoxelsModelConfig.carve`."""
-        found = [rays for rays in (model.feature_rays, evidence and evidence.feature_rays) if rays is not None]
-        if model.config.carve == "off" or not found:
+        if model.config.carve == "off" or rays is None:
             return
         assert attributes.pipeline is not None
         dataset: Any = attributes.pipeline.datamanager.train_dataset
         voxels, lattice = model.grid.voxels, model.grid.voxels.lattice
-        rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
         hidden = hardly_shown(lattice.index_to_world(centres), dataset.views())
@@ -75,20 +73,16 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             CONSOLE.log(
                 f"step {step}: {air.sum():,} of {len(air):,} voxels are air, or in view of fewer than two photographs"
             )
-            old = model.grid.row_parameters()
-            follow(old, prune(model.grid, ~air))
+            follow(prune(model.grid, ~air))
 
-    def follow(
-        old: dict[str, Parameter], change: RowChange | None, grid: VoxelGrid = model.grid, prefix: str = ""
-    ) -> None:
-        """Give the optimisers the new parameters of `grid` in place of `old`, and change their state by `change`."""
+    def follow(change: GridChange, grid: VoxelGrid = model.grid, prefix: str = "") -> None:
+        """Give the optimisers the new parameters of `grid`, and change their state by `change`."""
         assert attributes.optimizers is not None
-        if change is None:
-            return
         for name, new in grid.row_parameters().items():
-            if new is not old[name]:
+            (old,) = attributes.optimizers.parameters[prefix + name]
+            if new is not old:
                 optimizer: Any = attributes.optimizers.optimizers[prefix + name]
-                optimizer.change_rows(old[name], new, change)
+                optimizer.follow(old, new, change)
                 attributes.optimizers.parameters[prefix + name] = [new]
 
     def change_surroundings(step: int) -> None:
@@ -99,62 +93,58 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         datamanager: Any = attributes.pipeline.datamanager
         grid, prefix = model.seen_surroundings.grid, "surroundings_"
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
-        largest = voxel_weights(grid, model.sample_surroundings, rays).largest.cpu().numpy()
+        largest = voxel_weights(grid, model.sample_surroundings, rays)[0].cpu().numpy()
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
             model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
-        old = grid.row_parameters()
-        follow(old, prune(grid, keep), grid, prefix)
+        follow(prune(grid, keep), grid, prefix)
         if model.seen_surroundings is None:
             CONSOLE.log(f"step {step}: surroundings dropped, all that is outside the box lies at infinity")
             return
         if step in factors:
-            old = grid.row_parameters()
-            follow(old, refine(grid, factors[step]), grid, prefix)
+            follow(refine(grid, factors[step]), grid, prefix)
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
     def change_lattice(step: int) -> None:
-        assert attributes.pipeline is not None and attributes.optimizers is not None
-        datamanager = attributes.pipeline.datamanager
+        assert attributes.pipeline is not None
+        datamanager, config = attributes.pipeline.datamanager, model.config
         if step in decisions:
             decide_backdrop(model, datamanager)
-        thin = step in model.config.thin_at
-        threshold = model.config.thin_threshold if thin else model.config.prune_threshold
+        thin = step in config.thin_at
+        threshold = config.thin_threshold if thin else config.prune_threshold
         if step in steps and threshold > 0:
-            old = model.grid.row_parameters()
-            said, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
-            follow(old, change)
+            said, change = prune_by_rays(model, datamanager, threshold, 0 if thin else config.prune_dilation)
+            follow(change)
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {said}")
         if step in steps:
             change_surroundings(step)
         if step in factors:
-            old = model.grid.row_parameters()
+            lattice = model.grid.lattice.refined(factors[step])
+            voxels, channels = len(model.grid.voxels) * factors[step] ** 3, config.row_channels(max(lattice.cell_shape))
             try:
-                follow(old, model.split(factors[step]))
+                CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, config.memory_budget_gb)}")
             except MemoryBudgetError as problem:
-                if not model.config.voxel_pixels:  # the user gave this resolution
+                if not config.voxel_pixels:  # the user gave this resolution
                     raise
                 CONSOLE.log(f"step {step}: the lattice stays, where photographs ask for a finer one: {problem}")
-                finest = model.config.resolutions.index(max(model.grid.lattice.cell_shape))
-                known = model.config.resolutions[: finest + 1], model.config.refine_at[:finest]
-                model.config = replace(model.config, resolutions=known[0], refine_at=known[1])
+                finest = config.resolutions.index(max(model.grid.lattice.cell_shape))
+                known = config.resolutions[: finest + 1], config.refine_at[:finest]
+                model.config = replace(config, resolutions=known[0], refine_at=known[1])
                 trainer: Any = attributes.trainer
                 if trainer is not None:
                     trainer.save_found_settings()  # so that a run that resumes from here agrees
                 return
+            follow(refine(model.grid, factors[step]))
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
 
     def widen(step: int) -> None:
         """Let the grid store all harmonics of colour once their step is reached, and tell the optimiser."""
-        assert attributes.optimizers is not None
-        old, stored, degree = model.grid.sh, model.grid.sh_degree, model.config.sh_degree
+        stored, degree = model.grid.sh_degree, model.config.sh_degree
         if stored is None or degree is None or stored >= degree:
             return
         if int(model.trained_steps) >= model.config.view_dependence_from:
-            change, optimizer = widen_colour(model.grid, degree), attributes.optimizers.optimizers["sh"]
-            optimizer.change_columns(old, model.grid.sh, change)  # type: ignore[attr-defined]
-            attributes.optimizers.parameters["sh"] = [model.grid.sh]  # type: ignore[list-item]
+            follow(widen_colour(model.grid, degree))
 
     early = min(steps | decisions) // 3
     return [
@@ -189,23 +179,24 @@ def progress(first: int, end: int) -> Callable[[int], None]:
     return tell
 
 
-def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
-    """Find depths in photographs, give the evidence to the model and return it; None if depths are off or impossible.
+def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> FeatureRays | None:
+    """Find depths in photographs, if they are on and possible, and return the rays to all known points; None: no rays.
 
-    The model gets feature rays to depths, rays through a plain backdrop or to a plain ceiling, and, unless the training
-    is resumed, gains, offsets and first colours. See `ThermoxelsModelConfig.photo_depth`; depths need photographs in
-    training.
+    Known are points of structure from motion and depths. The model gets feature rays to both, rays through a plain
+    backdrop or to a plain ceiling, and, unless the training is resumed, gains, offsets and first colours. See
+    `ThermoxelsModelConfig.photo_depth`; depths need photographs in training.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
+    tracks = model.feature_rays
     if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
-        return None
+        return tracks
     if config.photo_depth == "auto":
         steps = 0 if trainer is None else trainer._start_step + trainer.config.max_num_iterations
         if steps < SHORTEST_RUN_WITH_DEPTHS:
-            return None
+            return tracks
     datamanager: Any = pipeline.datamanager
     if model.grid.sh is None or datamanager.config.streams == "thermal":
-        return None
+        return tracks
     box = model.scene_box.aabb.double().numpy()
     lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # not the grid's, which may be finer if resumed
     near = config.near_plane * model.unit
@@ -215,21 +206,20 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     if trainer is None or trainer._start_step == 0:
         assert found.photographs.index is not None
         model.correct_photographs(found.photographs.index, found.log_gain, found.offset)
-    tracks, depths, far = model.feature_rays, found.feature_rays, model.seen_surroundings is not None
-    if depths is not None and tracks is None:
-        model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
-    elif depths is not None and tracks is not None:
-        model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
+    rays, depths, far = tracks, found.feature_rays, model.seen_surroundings is not None
+    if depths is not None:
+        rays = depths if tracks is None else tracks.joined_with(depths)
+        model.feature_ray_sampler = FeatureRaySampler(rays, box, far, COARSE_LIGHT if tracks is None else 0.0)
     plain_rays = found.plain_rays(*box)
     model.backdrop_ray_sampler = None if plain_rays is None else FeatureRaySampler(plain_rays, box)
     model.plain_areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
-    return found
+    return rays
 
 
-def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, RowChange]:
+def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, GridChange]:
     """Drop all voxels but those to which some training ray of either stream gives more than `threshold` of its light.
 
     Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would
@@ -245,16 +235,16 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
         return datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
 
     field = model.grid, model.sample_rays
-    weights, voxels, opened = voxel_weights(*field, rays()), model.grid.voxels, 1.0
+    (largest, ends), voxels, opened = voxel_weights(*field, rays()), model.grid.voxels, 1.0
     density = model.grid.voxel_density().view(-1)[model.grid.cells].cpu().numpy()
     opaque = density * voxels.lattice.voxel_size > OPAQUE_DEPTH
     for attempt in range(PRUNING_ATTEMPTS):
         threshold = threshold / 4 if attempt else threshold
-        chosen = ((weights.largest > threshold) | weights.ends).cpu().numpy()
+        chosen = ((largest > threshold) | ends).cpu().numpy()
         if not chosen.any():
             continue
         keep = voxels.dilated(chosen, dilation) | (voxels.dilated(chosen, 1) & opaque)
-        opened = share_of_rays_opened(*field, rays(), torch.from_numpy(keep).to(weights.largest.device))
+        opened = share_of_rays_opened(*field, rays(), torch.from_numpy(keep).to(largest.device))
         if opened <= MOST_OPENED_RAYS:
             kept, total = int(keep.sum()), math.prod(voxels.lattice.cell_shape)
             said = (

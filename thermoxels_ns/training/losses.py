@@ -25,12 +25,10 @@ def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> F
     return torch.mean((predicted - target) ** 2)
 
 
-def thermal_loss(
-    predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"], l2_share: float = 0.5
-) -> Float[Tensor, ""]:
-    """Return l2_share L2 + (1 - l2_share) L1 of normalised temperature (paper, eq. 4, where lambda = 1/2)."""
+def thermal_loss(predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"]) -> Float[Tensor, ""]:
+    """Return half of L2 plus half of L1 of normalised temperature (paper, eq. 4, where lambda = 1/2)."""
     error = predicted - target
-    return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
+    return 0.5 * torch.mean(error**2) + 0.5 * torch.mean(error.abs())
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:

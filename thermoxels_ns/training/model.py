@@ -23,11 +23,10 @@ from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureRays
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
-from thermoxels_ns.field.refine import RowChange, refine
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -157,17 +156,6 @@ class ThermoxelsModel(Model):
             rows = self.surroundings.grid.row_parameters()
             groups |= {f"surroundings_{name}": [parameter] for name, parameter in rows.items()}
         return groups
-
-    def split(self, factor: int) -> RowChange:
-        """Split every kept voxel into factor^3, log the memory that takes, and return the change of rows.
-
-        Raises:
-            MemoryBudgetError: The finer lattice needs more than `memory_budget_gb`; the grid stays as it is.
-        """
-        lattice = self.grid.lattice.refined(factor)
-        voxels, channels = len(self.grid.voxels) * factor**3, self.config.row_channels(max(lattice.cell_shape))
-        CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
-        return refine(self.grid, factor)
 
     def update_to_step(self, step: int) -> None:
         """Set the step of training, on which weights, random blocks and random rays depend."""
@@ -406,17 +394,14 @@ class ThermoxelsModel(Model):
         images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
         images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
-        if not self.has_temperatures:
-            return metrics | self._fitted_metrics(outputs, seen, batch, valid), images
         if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
             valid = valid & batch["mask"].to(self.device).bool()
-        span_k = self.temperature_range.span_k
-        metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], seen["in_box"] > 0, span_k)
-        metrics |= self._fitted_metrics(outputs, seen, batch, valid)
-        images["thermal"] = colormaps.apply_float_colormap(
-            torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1), "inferno"
-        )
-        return metrics, images
+        if self.has_temperatures:
+            box, span_k = seen["in_box"] > 0, self.temperature_range.span_k
+            metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], box, span_k)
+            both = torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1)
+            images["thermal"] = colormaps.apply_float_colormap(both, "inferno")
+        return metrics | self._fitted_metrics(outputs, seen, batch, valid), images
 
     def _fitted_metrics(
         self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
@@ -474,25 +459,20 @@ class ThermoxelsModel(Model):
         of degree 0, which is the mean over directions where colour is the same from all sides, and about that mean
         elsewhere; corners without a row are grey.
         """
-        grid, colour, evidence = self.grid, None, None
-        seen = field_evidence(grid, self.sample_rays, rays)
+        grid, colour = self.grid, None
+        thermal, thermal_weight, evidence = field_evidence(grid, self.sample_rays, rays)
         # Corners without a row get the middle of the range; nothing reads these values.
-        thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
+        thermal = grid.corner_values(thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
             constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # degree 0 is the same in all directions
             mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
             channels = torch.sigmoid(mean).float().unbind(-1)
             colour = torch.stack([grid.corner_values(rows, 0.5) for rows in channels], -1).cpu().numpy()
-        if seen.rays:
-            weight = np.zeros(grid.lattice.cell_shape, dtype=np.float32)
-            weight.reshape(-1)[grid.voxels.cells] = seen.voxel_weight.cpu()
-            of_rays = seen.half_depth_density, seen.ends, seen.directions
-            evidence = RayEvidence(weight, *(values.float().cpu().numpy() for values in of_rays))
         return GridSnapshot(
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
-            observed_weight=grid.corner_values(seen.thermal_weight.float()).cpu().numpy(),
+            observed_weight=grid.corner_values(thermal_weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
             colour=colour,
             evidence=evidence,

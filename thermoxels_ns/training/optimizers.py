@@ -13,7 +13,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from torch import Tensor
 
 from thermoxels_ns.core.threads import run_ranges
-from thermoxels_ns.field.refine import ColumnChange, RowChange
+from thermoxels_ns.field.refine import GridChange
 
 
 class RowOptimizer(torch.optim.Optimizer):
@@ -53,21 +53,16 @@ class RowOptimizer(torch.optim.Optimizer):
         """Update ``parameter[rows]``, (rows, channels) as `gradient`, and `state`; `group` has settings such as lr."""
         raise TypeError(f"{type(self).__name__} does not say how rows are updated")
 
-    def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:
-        """Replace parameter `old` by `new`, whose rows were split or dropped, and change the state by `change`."""
-        self._change(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
-
-    def change_columns(self, old: Tensor, new: torch.nn.Parameter, change: ColumnChange) -> None:
-        """Replace parameter `old` by `new`, whose columns differ; state with the shape of `old` changes by `change`."""
-        self._change(old, new, lambda values: change(values) if values.shape == old.shape else values)
-
-    def _change(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
+    def follow(self, old: Tensor, new: torch.nn.Parameter, change: GridChange) -> None:
+        """Replace parameter `old` by `new`, whose rows or columns differ, and change the state by `change`."""
         for group in self.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = self.state.pop(old, None)  # type: ignore[arg-type]
         if state:
-            # One entry after the other, so that only one exists twice at a time.
-            self.state[new] = {name: change(state.pop(name)) for name in list(state)}
+            self.state[new] = {}
+            for name in list(state):  # one entry after the other, so that only one exists twice at a time
+                values = state.pop(name)
+                self.state[new][name] = change(values) if values.ndim > 1 else change(values[:, None])[:, 0]
 
 
 def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:

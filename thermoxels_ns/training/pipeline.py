@@ -141,16 +141,12 @@ class ThermoxelsPipeline(VanillaPipeline):
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Return metrics averaged over held-out images and, in ns-eval, those of `geometry_metrics`."""
+        """Return metrics averaged over held-out images and, in ns-eval, those of `compare_with_truth`."""
         averages = super().get_average_eval_image_metrics(*args, **kwargs)
-        if self.test_mode == "test":  # ns-eval; training has "val"
-            averages |= self.geometry_metrics()
-        return averages
-
-    def geometry_metrics(self) -> dict[str, float]:
-        """Return metrics of the surface against the exact scene; empty without `compare_with_truth`."""
         compare = type(self).compare_with_truth
-        return {} if compare is None else compare(self)
+        if self.test_mode == "test" and compare is not None:  # ns-eval; training has "val"
+            averages |= compare(self)
+        return averages
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Return metrics averaged over images; images where a metric is NaN are left out of its average.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from thermoxels_ns.core.feature_rays import THERMAL_STREAM
+from thermoxels_ns.core.snapshot import RayEvidence
 from thermoxels_ns.field.interpolation import splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
@@ -29,25 +30,19 @@ def _sampled(
         yield bundle, directions, sample(bundle.origins.to(device), directions)
 
 
-@dataclass(frozen=True)
-class VoxelWeights:
-    """Statistics of the weights of rays for each kept voxel."""
-
-    largest: Float[Tensor, " voxels"]  # Largest weight of a sample in the voxel on any ray
-    ends: Bool[Tensor, " voxels"]
-    """True where some ray that ends on something (opacity above one half) completes half of its weight in the voxel."""
-
-
 @torch.no_grad()
-def voxel_weights(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> VoxelWeights:
-    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel."""
+def voxel_weights(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> tuple[Float[Tensor, " voxels"], Bool[Tensor, " voxels"]]:
+    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel: a
+    ray that ends on something (opacity above one half) completes half of its weight there."""
     device = grid.density.device
     largest = torch.zeros(len(grid.voxels), device=device)
     ends = torch.zeros(len(grid.voxels), dtype=torch.bool, device=device)
     for _, _, samples in _sampled(grid, sample, rays):
         largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
         ends[samples.at.number[_half_way(samples)]] = True
-    return VoxelWeights(largest, ends)
+    return largest, ends
 
 
 def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
@@ -87,29 +82,15 @@ although rays end in it; the solid begins with the next voxel, whose centre is a
 _END_STEPS = 5
 
 
-@dataclass(frozen=True)
-class FieldEvidence:
-    """Statistics of training rays about the trained field, for the mesher."""
-
-    rays: int  # Number of rays
-    thermal: Float[Tensor, " rows"]
-    """Normalised temperature that thermal rays see around each corner of a kept voxel, clipped to [0, 1]; the stored
-    value at corners that no thermal ray reaches."""
-    thermal_weight: Float[Tensor, " rows"]
-    """Sum of the weights of the first-hit samples around each corner, shared out by trilinear weights, [rays]."""
-    voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights of all rays in each kept voxel, [rays]
-    ends: Float[Tensor, "ends 3"]
-    """Points at which the rays that end on something (opacity above one half) complete half of their weight, in corner
-    indices, in the order of the rays."""
-    directions: Float[Tensor, "ends 3"]  # Unit vectors of these rays
-    half_depth_density: Float[Tensor, " ends"]
-    """One density for each of these rays, [1 / world unit]: the highest at the centres of the voxels that the ray
-    crosses within `END_WIDTH` of its end."""
-
-
 @torch.no_grad()
-def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> FieldEvidence:
-    """Return the evidence of training rays about the trained field, found in one pass.
+def field_evidence(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> tuple[Float[Tensor, " rows"], Float[Tensor, " rows"], RayEvidence | None]:
+    """Return what training rays say about the trained field, found in one pass.
+
+    These are the normalised temperature around each corner of a kept voxel, clipped to [0, 1], which is the stored one
+    where no thermal ray came; the sum of the weights of first-hit samples around each corner, shared out by trilinear
+    weights, [rays]; and where rays end, in their order (None: there are no rays).
 
     The temperature of a corner is a mean over samples of thermal rays, weighted by their share of the pixel; stored
     values of single corners can overshoot where images are right, but this mean cannot. Only first hits count: samples
@@ -122,9 +103,9 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
     voxels = torch.zeros(len(grid.voxels), dtype=torch.float64, device=device)
     ends, along = [corners.new_zeros(0, 3)], [corners.new_zeros(0, 3)]
     half_depth = [centre_density.view(-1)[:0]]
-    seen = 0
+    seen = False
     for bundle, directions, samples in _sampled(grid, sample, rays):
-        seen += len(directions)
+        seen |= len(directions) > 0
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
         at_half, ray = samples.at.select(half_way), samples.ray[half_way]
@@ -144,8 +125,13 @@ def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) 
     weight = corners[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
-    of_rays = torch.cat(ends), torch.cat(along), torch.cat(half_depth)
-    return FieldEvidence(seen, thermal.clamp(0, 1), weight, voxels, *of_rays)
+    evidence = None
+    if seen:
+        voxel_weight = np.zeros(grid.lattice.cell_shape, dtype=np.float32)
+        voxel_weight.reshape(-1)[grid.voxels.cells] = voxels.cpu()
+        of_rays = (torch.cat(parts).float().cpu().numpy() for parts in (half_depth, ends, along))
+        evidence = RayEvidence(voxel_weight, *of_rays)
+    return thermal.clamp(0, 1), weight, evidence
 
 
 def _density_met(

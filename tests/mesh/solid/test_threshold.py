@@ -146,13 +146,9 @@ class Layers:
         y, z = np.meshgrid(*[np.linspace(0.05, 7.95, 40)] * 2, indexing="ij")
         origins = torch.tensor(np.stack([np.full_like(y, 24.0), y, z], -1).reshape(-1, 3) * LAYERS.voxel_size).float()
         directions = torch.tensor([-1.0, 0.0, 0.0]).expand_as(origins)
-        seen = field_evidence(
-            self.grid, self.sample_rays, [RayBundle(origins, directions, torch.ones(len(origins), 1))]
-        )
-        weight = seen.voxel_weight.view(LAYERS.cell_shape).float().numpy()
+        rays = [RayBundle(origins, directions, torch.ones(len(origins), 1))]
+        evidence = field_evidence(self.grid, self.sample_rays, rays)[2]
         zero = np.zeros(LAYERS.shape, np.float32)
-        of_rays = (values.numpy() for values in (seen.half_depth_density, seen.ends, seen.directions))
-        evidence = RayEvidence(weight, *of_rays)
         density = self.grid.voxel_density().numpy()
         return GridSnapshot(LAYERS, zero, zero, zero, voxel_density=density, evidence=evidence)
 

@@ -141,17 +141,11 @@ def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tu
     return scale, np.linalg.norm(b - scale * rotated, axis=1)
 
 
-def _ray_of_depth_1(model: SfmModel, index: int, pixel: npt.ArrayLike) -> FloatArray:
-    """Return the world vector (3,) from the camera of a frame to what a pixel (2,) shows at depth 1."""
-    along = model.camera.rays(np.asarray(pixel, dtype=np.float64)[None])[0] * (1.0, -1.0, -1.0)
-    return along @ model.camera_to_world[index, :3, :3].T
-
-
 def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
     """Return the point nearest to all rays, shape (3,), and its reprojection errors, shape (views,), [pixels]."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for index, pixel in views:
-        ray = _ray_of_depth_1(model, index, pixel)
+        ray = model.camera.rays(pixel[None])[0] * (1.0, -1.0, -1.0) @ model.camera_to_world[index, :3, :3].T
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         right += across @ model.centres[index]

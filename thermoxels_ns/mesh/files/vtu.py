@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_array, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, PatchRules, with_patches
@@ -492,7 +492,7 @@ def _array(data: Any, array: str, name: str) -> npt.NDArray:
     if array not in data:
         raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
     values = np.array(data[array])
-    return values if values.dtype.kind == "U" else check_finite(f"{name}: {array}", values, _REMEDY, MeshError)
+    return values if values.dtype.kind == "U" else check_array(f"{name}: {array}", values, None, _REMEDY, MeshError)
 
 
 def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
