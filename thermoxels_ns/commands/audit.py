@@ -324,8 +324,6 @@ def _write(
     compared: Comparison | None,
 ) -> tuple[str, ...]:
     """Write all files and return their names."""
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
     from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
@@ -348,7 +346,7 @@ def _write(
     answers = answers_of(options, found, envelope, compared) | {"report": asdict(report)}
     plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
-    write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
+    write_vtk(folder / SURFACE, found.to_pyvista())
     title = found.conditions.title
     for kind, name in ENVELOPES.items():
         if envelope is None or kind not in options.envelope:

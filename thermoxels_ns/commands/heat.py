@@ -219,7 +219,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
     from thermoxels_ns.heat.vtk_series import remove_heat_series, shown_states, write_heat_series
-    from thermoxels_ns.mesh.files.vtu import write_vtu
+    from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
     from thermoxels_ns.reports.page import identify, write_page
@@ -232,7 +232,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
         remove_heat_series(folder / THROUGH_TIME)
-        write_vtu(folder / STEADY, replace(shown.mesh, temperature_c=shown.states_c[-1]))
+        write_vtk(folder / STEADY, body_grid(replace(shown.mesh, temperature_c=shown.states_c[-1])))
     else:
         states = shown_states(run.solution.times_s, options.vtk_times)
         write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)

@@ -13,7 +13,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.mesh.files.vtu import write_vtu
+from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 STEP_PATTERN = "step-*.vtu"  # Names of the files of a series
@@ -42,7 +42,7 @@ def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: 
     collection = ElementTree.SubElement(root, "Collection")
     for number, state in enumerate(states):
         path, time_s = folder / f"step-{number:04d}.vtu", float(solution.times_s[state])
-        write_vtu(path, replace(mesh, temperature_c=solution.temperature_c[state]))
+        write_vtk(path, body_grid(replace(mesh, temperature_c=solution.temperature_c[state])))
         name = path.relative_to(pvd.parent).as_posix()
         ElementTree.SubElement(collection, "DataSet", timestep=repr(time_s), part="0", file=name)
     ElementTree.indent(root)

@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.solvers import write_inp, write_msh, write_xdmf
-from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, write_vtu
+from thermoxels_ns.mesh.files.vtu import body_grid, boundary_path, boundary_surface, write_vtk
 from thermoxels_ns.mesh.tetrahedra import TetMesh, nodes_and_triangles
 
 MESH_FORMATS = (".vtu", ".xdmf", ".msh", ".inp", ".glb")
@@ -50,8 +50,8 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
     """
     path = Path(path)
     if path.suffix == ".vtu":
-        write_boundary_vtp(boundary_path(path), mesh)
-        write_vtu(path, mesh)
+        write_vtk(boundary_path(path), boundary_surface(mesh))
+        write_vtk(path, body_grid(mesh))
     elif path.suffix == ".glb":
         write_glb(path, mesh, up=up)
     else:
