@@ -14,6 +14,7 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
+_ESTIMATE_TOLERANCE = 1e-3  # Relative tolerance of the linear solver for error estimates
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths of a stage count as equal
 
 
@@ -130,7 +131,7 @@ class RungeKutta:
         difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
         end_s = time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
-        error_k = equation.damped(difference_w, float(np.sum(exchange_w)), start_k, end_s)
+        error_k, _ = equation.correction(difference_w, float(np.sum(exchange_w)), start_k, end_s, _ESTIMATE_TOLERANCE)
         return float(np.max(np.abs(error_k)))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:

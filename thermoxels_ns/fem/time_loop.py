@@ -62,7 +62,11 @@ def solve_heat(
         HeatError: An effect does not fit the mesh, a material stores next to no heat, a step's solver does not
             converge, or the temperature falls below absolute zero.
     """
-    _check_stores(problem)
+    least = float(np.min(problem.heat_capacity_j_m3k))
+    if least < LEAST_CAPACITY_J_M3K:
+        expected = f"at least {LEAST_CAPACITY_J_M3K:g} J/(m3 K) to follow a body through time (air has 1200)"
+        remedy = "Correct density and specific heat of the material, or ask for the steady state."
+        raise HeatError("heat capacity", expected=expected, got=f"{least:g} J/(m3 K)", remedy=remedy)
     times_s = np.append(0.0, np.cumsum(time)) if isinstance(time, np.ndarray) else time.times_s
     balance = HeatBalance(HeatSystem(problem), times_s)
     if isinstance(time, AdaptiveSteps):
@@ -228,11 +232,3 @@ def _fitted(wished_s: float, left_s: float) -> float:
     [10.0, 5.0, 3.0]
     """
     return left_s if wished_s >= left_s else min(wished_s, 0.5 * left_s)
-
-
-def _check_stores(problem: HeatProblem) -> None:
-    least = float(np.min(problem.heat_capacity_j_m3k))
-    if least < LEAST_CAPACITY_J_M3K:
-        expected = f"at least {LEAST_CAPACITY_J_M3K:g} J/(m3 K) to follow a body through time (air has 1200)"
-        remedy = "Correct density and specific heat of the material, or ask for the steady state."
-        raise HeatError("heat capacity", expected=expected, got=f"{least:g} J/(m3 K)", remedy=remedy)
