@@ -247,7 +247,7 @@ def test_a_tolerance_is_met_on_a_finer_mesh_and_everything_is_that_of_it(folder)
     error = np.abs(np.asarray(written.point_data["temperature_c"]) - exact_c)[: len(given.points_m)].max()
     assert error <= 0.5 and 1 / 3 < accuracy["estimated_k"] / error < 3
     assert found["probes"][0]["temperature_c"][0] == pytest.approx(
-        float(place_probes(fine, [(0.5, 2.0, 2.0)]).at(exact_c)[0]), abs=0.5
+        float((place_probes(fine, [(0.5, 2.0, 2.0)]) @ exact_c)[0]), abs=0.5
     )
     assert found["coldest"]["temperature_c"] == pytest.approx(float(written.point_data["temperature_c"].min()))
     # Flows of quadratic tetrahedra agree by effect, by patch, by region and as a wall.

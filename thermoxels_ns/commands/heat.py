@@ -202,9 +202,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         "no_wall": run.no_wall,
         "unfit": list(run.unfit),
         "layers": [asdict(one) for one in run.layers],
-        "probes": [
-            {"point_m": point, "temperature_c": values} for point, values in zip(run.probes.points_m, run.probes_c.T)
-        ],
+        "probes": [{"point_m": point, "temperature_c": values} for point, values in zip(run.probes_m, run.probes_c.T)],
         "built": [heat.effect for heat in solution.effects],
         "left_out": [asdict(entry) for entry in run.left_out],
         "newton_iterations": int(np.sum(solution.newton_iterations)),

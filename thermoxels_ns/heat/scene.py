@@ -94,7 +94,7 @@ class HeatScene:
     description: str = ""  # Description of the scene, for reports
 
     def __post_init__(self) -> None:
-        if self.sky is not None and self.sky.needs_air and self.outside_air is None:
+        if self.sky is not None and self.sky.temperature_c is None and self.outside_air is None:
             remedy = "Add outside_air, or give the sky's temperature_c."
             raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
         for key, air in (("inside_air", self.inside_air), ("outside_air", self.outside_air)):

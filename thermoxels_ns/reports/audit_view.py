@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 from collections.abc import Iterator
 from functools import cache
 from html import escape
@@ -59,7 +60,8 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
     for (name, unit, scale, cut), every in values.items():
         low, high = np.nanquantile(every[surface.counted], (cut, 1.0 - cut)).tolist()
         told = {"name": name, "unit": unit, "scale": get_colorscale(scale), "low": low, "high": max(high, low + 1e-3)}
-        quantities.append({**told, "values": _rounded(every[shown])})
+        rounded = every[shown].round(2).tolist()
+        quantities.append({**told, "values": [value if math.isfinite(value) else None for value in rounded]})
     return packed(
         json.dumps(
             {
@@ -85,11 +87,6 @@ def drawn_triangles(audit: Audit) -> BoolArray:
         return np.ones(len(audit.surface.why_not), dtype=bool)
     kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
     return ~np.isin(audit.surface.why_not, kinds)
-
-
-def _rounded(values: FloatArray) -> list[float | None]:
-    """Return values with two decimals, None where one is not finite."""
-    return [value if np.isfinite(value) else None for value in values.round(2).tolist()]
 
 
 def numbered_defects(audit: Audit) -> Iterator[tuple[int, Defect, FloatArray]]:

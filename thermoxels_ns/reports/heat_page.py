@@ -27,7 +27,7 @@ def heat_page(
 ) -> str:
     """Return a heat run's page as html; `pictures` are PNG contents by file name, `files` names of files beside it."""
     solution = run.solution
-    names = [f"{point_text(point)} m" for point in run.probes.points_m]
+    names = [f"{point_text(point)} m" for point in run.probes_m]
     over_time = isinstance(solution, HeatSolution)
     return build_page(
         "heat.html.j2",

@@ -49,6 +49,7 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
         OutputError: A file cannot be written.
     """
     path = Path(path)
+    writable_folder(path.parent)
     if path.suffix == ".vtu":
         write_vtk(boundary_path(path), boundary_surface(mesh))
         write_vtk(path, body_grid(mesh))
@@ -102,7 +103,6 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     place = turn @ trimesh.transformations.translation_matrix(origin)
     scene = trimesh.Scene()
     scene.add_geometry(shown, node_name="surface", geom_name="surface", transform=place)
-    writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         temporary.write_bytes(export_glb(scene, tree_postprocessor=_finish))
 

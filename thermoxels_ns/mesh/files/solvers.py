@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import IntArray
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.vtu import node_arrays
@@ -65,7 +65,6 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     data_file = path.with_suffix(".h5")
     text = _index(mesh.region_names, tags.patch_names, arrays, escape(data_file.name))
 
-    writable_folder(path.parent)
     with replace_when_done(data_file) as temporary:
         with h5py.File(temporary, "w") as file:
             for name, values in arrays.items():
@@ -135,7 +134,6 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
         # The entries are name, time 0, step 0, number of components and number of nodes.
         head = f'1\n"{TEMPERATURE_VIEW}"\n1\n0.0\n3\n0\n1\n{nodes}\n'
         sections[b"NodeData"] = head.encode() + _numbered(1, ("value", _DOUBLE), mesh.temperature_c)
-    writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.writelines(b"$%b\n%b\n$End%b\n" % (name, text, name) for name, text in sections.items())
 
@@ -177,7 +175,6 @@ def write_inp(path: Path | str, mesh: TetMesh, *, steps: int = 10, step_seconds:
     patches = _set_names("boundary.patch_names", tags.patch_names)
     # What can fail on a bad mesh is done before the file is opened.
     owner, opposite = facet_owners(mesh.tets, mesh.facets)
-    writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
         file.write("*HEADING\nTetrahedral mesh with measured temperatures; metres, seconds, degrees Celsius\n")
         file.writelines(_nodes_and_elements(mesh, regions))

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, PatchRules, with_patches
@@ -46,13 +46,9 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 
 
 def write_vtk(path: Path, data: pv.PolyData | pv.UnstructuredGrid) -> None:
-    """Write polygons (.vtp) or a grid (.vtu) as ParaView, pyvista and meshio read it, making the folder.
-
-    Raises `OutputError` if the file cannot be written.
-    """
+    """Write polygons (.vtp) or a grid (.vtu) as ParaView and pyvista read it; raise `OutputError` on failure."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
-    writable_folder(path.parent)
     writer: Any = vtkXMLPolyDataWriter() if path.suffix == ".vtp" else vtkXMLUnstructuredGridWriter()
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
