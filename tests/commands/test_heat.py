@@ -17,7 +17,7 @@ from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.errors import HeatError, OutputError, ThermoxelsError
-from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.linear_tets import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.run import place_probes
 from thermoxels_ns.heat.scene import load_heat_scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -181,36 +181,6 @@ def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, S
     return selection, PatchRules() if options.patches is None else load_patch_rules(options.patches), distance
 
 
-def scale_of(options: ExportOptions, distance: SceneScale | None, scene_file: Mapping) -> SceneScale | None:
-    """Return the scale of an export: from the options, or else from the scene's json; None if neither has a scale.
-
-    Raises `ThermoxelsError` for a scale out of range, or if a format or an option needs a scale and there is none.
-    """
-    scale = choose_scale(options.metres_per_unit, distance, scene_file)
-    asked = {
-        "--formats inp": "inp" in options.formats,
-        "--wall-thickness": options.wall_thickness is not None,
-        "--patches": options.patches is not None,
-    }
-    needs = [option for option, given in asked.items() if given]
-    if scale is None and needs:
-        remedy = "Pass --metres-per-unit, or --known-distance."
-        got = "none in the options or in the scene's json"
-        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
-    return scale
-
-
-def up_of(
-    options: ExportOptions, scene_file: Mapping[str, Any], viewpoint: Viewpoint
-) -> tuple[tuple[float, float, float], str]:
-    """Return the unit vector up and a sentence on its source: --up, else the scene's json, else `viewpoint`."""
-    if options.up is not None:
-        x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
-        return (x, y, z), "Given with --up."
-    in_file = up_from_scene_file(scene_file)
-    return (viewpoint.up, viewpoint.up_source) if in_file is None else (in_file, "From the scene's json.")
-
-
 def prepare_folder(output_dir: Path | str) -> Path:
     """Make an export's folder, without half-written files; raises `OutputError` if it holds files of others."""
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
@@ -230,9 +200,20 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
 
     selection, rules, distance = check_options(options)
     scene_file, lattice = scene_json(run.scene_folder), run.snapshot.lattice
-    scale = scale_of(options, distance, scene_file)
+    scale = choose_scale(options.metres_per_unit, distance, scene_file)
+    needs = ["--formats inp"] * ("inp" in options.formats) + ["--wall-thickness"] * (options.wall_thickness is not None)
+    needs += ["--patches"] * (options.patches is not None)
+    if scale is None and needs:
+        remedy = "Pass --metres-per-unit, or --known-distance."
+        got = "none in the options or in the scene's json"
+        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
     metres = 1.0 if scale is None else scale.metres_per_unit
-    up, up_source = up_of(options, scene_file, run.viewpoint)
+    up, up_source = run.viewpoint.up, run.viewpoint.up_source
+    if options.up is not None:
+        x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
+        up, up_source = (x, y, z), "Given with --up."
+    elif (in_file := up_from_scene_file(scene_file)) is not None:
+        up, up_source = in_file, "From the scene's json."
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
     built = build_mesh(run.snapshot, selection, to_mesh, options.boundary, up=up, rules=rules, metres_per_unit=metres)
     depths = None if run.dataset is None else depths_of_dataset(run.dataset, 0.0, lattice.lo, lattice.hi)
@@ -349,8 +330,8 @@ def with_support(
 
     See `facet_views` and `supporting_photographs`. Matrix `to_mesh`, (4, 4), leads from the trained scene to the mesh.
     """
-    from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
+    from thermoxels_ns.mesh.solid.free_space import facet_views
     from thermoxels_ns.mesh.tetrahedra import facet_normals
     from thermoxels_ns.multiview.votes import supporting_photographs
 

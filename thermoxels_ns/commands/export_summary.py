@@ -15,7 +15,6 @@ from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.mesh.build import BuiltMesh
 from thermoxels_ns.mesh.quality.checks import MeshFigures
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.solid.voxels import SolidCells
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, support_of_facets
 
 
@@ -101,7 +100,9 @@ def mesh_summary(built: BuiltMesh, figures: MeshFigures, scale: SceneScale | Non
 
 def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
     """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
-    points, left_out, found = built.mesh.points_m, int(built.solid.left_out.sum()), _voxels_found(built.solid)
+    points, left_out = built.mesh.points_m, int(built.solid.left_out.sum())
+    # Solid voxels in the whole lattice, before regions are left out and interiors are filled.
+    found = sum(step.added for step in built.solid.steps if step.name in ("threshold", "close gaps"))
     return {
         "asked_for": asked_for,
         "size": points.max(axis=0) - points.min(axis=0),
@@ -109,11 +110,6 @@ def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
         "voxels_left_out": left_out,
         "share_of_solid_taken": 1.0 - left_out / found,
     }
-
-
-def _voxels_found(solid: SolidCells) -> int:
-    """Return the number of solid voxels in the whole lattice, before regions are left out and interiors are filled."""
-    return sum(step.added for step in solid.steps if step.name in ("threshold", "close gaps"))
 
 
 def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:

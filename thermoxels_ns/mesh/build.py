@@ -11,8 +11,8 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions, with_patches
-from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
+from thermoxels_ns.mesh.solid.free_space import seen_facets
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
