@@ -336,13 +336,8 @@ def _write(
     earlier = options.compare and options.compare.with_name(SURFACE)
     more = [options.patches, options.compare, earlier, *(Path(one) for one in series if one)]
     north = options.north if options.envelope else None
-    report = identify(
-        (*inputs, *filter(None, more)),
-        options.up,
-        options.least_bridge_w,
-        north,
-        *filter(None, [options.compare_difference]),
-    )
+    choices = options.up, options.least_bridge_w, north, *filter(None, [options.compare_difference])
+    report = identify((*inputs, *filter(None, more)), *choices)
     answers = answers_of(options, found, envelope, compared) | {"report": asdict(report)}
     plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)

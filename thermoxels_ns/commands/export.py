@@ -236,8 +236,7 @@ def export_scene(
         ThermoxelsError: An option is wrong, nothing is solid, or a file cannot be written.
     """
     from thermoxels_ns.commands import export_summary
-    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
-    from thermoxels_ns.mesh.files.solvers import check_start
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_start, write_mesh
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
 
     check_options(options)
@@ -301,7 +300,10 @@ def _draw(folder: Path, run: TrainedScene, made: SceneMesh) -> None:
 
     mesh, unit, (every, measured, region, support) = made.built.mesh, made.unit, [folder / name for name in _PICTURES]
     look = {"up": made.up, "view_direction": run.viewpoint.view_direction}
-    mesh_pictures.draw_mesh([every, measured], mesh, look, unit)
+    no_ray: Any = {"painted": [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]}
+    for path, title, grey in ((every, "Surface temperature", {}), (measured, "Measured surface temperature", no_ray)):
+        image = mesh_pictures.image_of_mesh(mesh, title=title, length_unit=unit, **look, **grey)
+        mesh_pictures.write_picture(path, image)
     if support_of_facets(mesh) is not None:
         mesh_pictures.draw_support(support, mesh, look)
     # Faces of the voxels that are not exported are drawn in grey.

@@ -246,15 +246,19 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
             "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
             'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.',
         )
-    if inside_air is not None and not _has_rooms(selection, matching_facets(selection, inside_air.patches)):
-        area = float(selection.facet_area_m2[matching_facets(selection, inside_air.patches)].sum())
-        return (
-            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
-            "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
-            "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
-            "name the inner surface with --patches.",
-        )
-    return ()
+    if inside_air is None:
+        return ()
+    inside = matching_facets(selection, inside_air.patches)
+    area, whole = selection.facet_area_m2[inside], float(selection.facet_area_m2[inside].sum())
+    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    if float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * whole:  # walls and floors of rooms
+        return ()
+    return (
+        f"The scene names air inside, but the body has no rooms: of the {whole:.4g} m² that no photograph saw, next "
+        "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
+        "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
+        "name the inner surface with --patches.",
+    )
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -412,13 +416,6 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
         "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
         "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
     )
-
-
-def _has_rooms(selection: Selection, inside: BoolArray) -> bool:
-    """Return whether enough of the triangles marked in `inside` face up or sideways to be walls and floor of rooms."""
-    area = selection.facet_area_m2[inside]
-    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
-    return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
 
 
 def _outwards(selection: Selection, chosen: BoolArray) -> float:

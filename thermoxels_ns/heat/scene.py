@@ -120,11 +120,6 @@ class HeatScene:
         """True if the steady state is asked for, `time` being None."""
         return self.time is None
 
-    @property
-    def uses_photographs(self) -> bool:
-        """True if the result depends on a temperature that photographs measured."""
-        return self.time is not None and self.initial_c is None
-
     def on(self, mesh: TetMesh) -> HeatScene:
         """Return the scene whose default patches include the mesh's named ones: what photographs show is outside.
 

@@ -23,9 +23,8 @@ from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
-from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import interval_text
-from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
+from thermoxels_ns.reports.page import Picture, Report, build_page, gradient, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
 """PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
@@ -203,6 +202,11 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
         told = {"name": name, "unit": unit, "scale": get_colorscale(scale), "low": low, "high": max(high, low + 1e-3)}
         rounded = every[shown].round(2).tolist()
         quantities.append({**told, "values": [value if math.isfinite(value) else None for value in rounded]})
+    marks = []  # of the bridges that count: number, text and place, [mm], a little before the surface
+    for number, one, normal in numbered_defects(audit):
+        at = 1e3 * (np.array(one.centre_m) + _BEFORE_SURFACE_M * normal)
+        text = f"{number}: {escape(one.patch)}<br>{interval_text(one.extra_w, 'W')} extra<br>click for more"
+        marks.append({"number": number, "at": at.round().tolist(), "text": text})
     return packed(
         json.dumps(
             {
@@ -212,7 +216,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
                 "patch": selection.facet_patch[shown].tolist(),
                 "patches": [escape(name) for name in selection.patch_names],
                 "quantities": quantities,
-                "bridges": _marks(audit),
+                "bridges": marks,
                 "up": list(selection.up),
                 "eye": (-1.9 * toward / np.linalg.norm(toward)).tolist(),
                 "inside": audit.conditions.side == "inside",
@@ -236,16 +240,6 @@ def numbered_defects(audit: Audit) -> Iterator[tuple[int, Defect, FloatArray]]:
         if not one.not_counted:
             normal = audit.surface.area_m2[found.core] @ audit.surface.selection.facet_normal[found.core]
             yield number, one, normal / (float(np.linalg.norm(normal)) or 1.0)
-
-
-def _marks(audit: Audit) -> list[dict[str, object]]:
-    """Return number, text and place, [mm], of the bridges that count, a little before the surface."""
-    marks = []
-    for number, one, normal in numbered_defects(audit):
-        at = 1e3 * (np.array(one.centre_m) + _BEFORE_SURFACE_M * normal)
-        text = f"{number}: {escape(one.patch)}<br>{interval_text(one.extra_w, 'W')} extra<br>click for more"
-        marks.append({"number": number, "at": at.round().tolist(), "text": text})
-    return marks
 
 
 def thinned(
