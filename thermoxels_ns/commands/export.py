@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-from collections.abc import Callable, Iterable
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,18 +15,21 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
-from thermoxels_ns.core.lattice import Lattice, input_from_world
+from thermoxels_ns.core.lattice import input_from_world
+from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.scene_scale import (
     SceneScale,
     choose_scale,
     scale_from_known_distance,
     up_from_scene_file,
 )
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, facet_normals, support_of_facets
 
 if TYPE_CHECKING:
     from thermoxels_ns.core.feature_rays import FeatureRays
@@ -218,7 +223,7 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     built = build_mesh(run.snapshot, selection, to_mesh, options.boundary, up=up, rules=rules, metres_per_unit=metres)
     depths = None if run.dataset is None else depths_of_dataset(run.dataset, 0.0, lattice.lo, lattice.hi)
     if depths is not None:
-        built = with_support(built, depths, run.tracks, lattice, to_mesh)
+        built = with_support(built, depths, run, to_mesh)
     unit = "input unit" if scale is None else "m"
     return SceneMesh(built, check_mesh(built.mesh), scale, unit, to_mesh, up, up_source)
 
@@ -235,9 +240,7 @@ def export_scene(
     Raises:
         ThermoxelsError: An option is wrong, nothing is solid, or a file cannot be written.
     """
-    from thermoxels_ns.commands import export_summary
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_start, write_mesh
-    from thermoxels_ns.mesh.tetrahedra import support_of_facets
 
     check_options(options)
     folder = prepare_folder(output_dir)
@@ -249,8 +252,8 @@ def export_scene(
     voxel_size = run.snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(made.to_mesh[:3, :3]))))
     say(f"Up: {', '.join(f'{value:.3g}' for value in made.up)}. {made.up_source}")
     asked_for = "near a point" if options.region_near else "a box" if options.region_box else options.region
-    region = export_summary.region_summary(made.built, asked_for)
-    for line in export_summary.lines_on_mesh(made.built, region, figures.volume_m3, unit, voxel_size):
+    region = region_summary(made.built, asked_for)
+    for line in lines_on_mesh(made.built, region, figures.volume_m3, unit, voxel_size):
         say(line)
     if options.boundary == "voxel":
         say(
@@ -266,13 +269,13 @@ def export_scene(
         files += _PICTURES[: 3 if support_of_facets(mesh) is None else 4]
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(ExportOptions)},
-        "versions": export_summary.versions(),
+        "versions": versions(),
         "length_unit": unit,
         "scale": None if made.scale is None else asdict(made.scale),
         "up": made.up,
         "up_source": made.up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(made.built, figures, made.scale),
+        "mesh": mesh_summary(made.built, figures, made.scale),
         "corrections": run.corrections,
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
@@ -295,7 +298,6 @@ def export_scene(
 def _draw(folder: Path, run: TrainedScene, made: SceneMesh) -> None:
     """Draw the pictures of a mesh into a folder."""
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
 
     mesh, unit, (every, measured, region, support) = made.built.mesh, made.unit, [folder / name for name in _PICTURES]
@@ -321,29 +323,22 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
 
 
-def with_support(
-    built: BuiltMesh,
-    depths: Depths,
-    tracks: FeatureRays | None,
-    lattice: Lattice,
-    to_mesh: FloatArray,
-) -> BuiltMesh:
+def with_support(built: BuiltMesh, depths: Depths, run: TrainedScene, to_mesh: FloatArray) -> BuiltMesh:
     """Return `built` with the numbers of photographs that see and that support each boundary triangle.
 
     See `facet_views` and `supporting_photographs`. Matrix `to_mesh`, (4, 4), leads from the trained scene to the mesh.
     """
     from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.mesh.solid.free_space import facet_views
-    from thermoxels_ns.mesh.tetrahedra import facet_normals
     from thermoxels_ns.multiview.votes import supporting_photographs
 
-    mesh = built.mesh
+    mesh, lattice = built.mesh, run.snapshot.lattice
     middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
     normal = facet_normals(mesh.points_m, mesh.facets) @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
     photographs = depths.photographs
     cameras = photographs.matrices, photographs.centres, photographs.sizes
     views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
-    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, tracks)
+    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, run.tracks)
     count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
     return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
 
@@ -425,3 +420,119 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
+
+
+def lines_on_mesh(
+    built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
+) -> Iterator[str]:
+    """Yield lines on each step to the solid, and on the mesh; `region` is `region_summary`, lengths are in `unit`."""
+    for step in built.solid.steps:
+        amounts = []
+        for sign, voxels in (("+", step.added), ("-", step.removed)):
+            volume_m3 = voxels * voxel_size**3
+            told = f"{1e3 * volume_m3:.3g} l" if volume_m3 < 1.0 else f"{volume_m3:.3g} m^3"
+            size = f" ({told})" if unit == "m" else ""
+            if voxels:
+                amounts.append(f"{sign}{voxels} voxels{size}")
+        changed = ", ".join(amounts) or "nothing changed"
+        if step.name == "region":
+            size = " x ".join(f"{side:.3g}" for side in region["size"])
+            share, name = region["share_of_solid_taken"], region["asked_for"]
+            yield f"Region, {name}: {size} {unit}, {share:.1%} of the solid; {changed}. {step.remark}"
+        else:
+            yield f"Solid, {step.name}: {changed}. {step.remark}"
+    mesh = built.mesh
+    yield f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3"
+    if built.unobserved_parts:
+        yield (
+            f"Left out because no thermal ray saw them: {built.unobserved_parts} parts of the mesh, "
+            f"{built.unobserved_voxels} voxels in all."
+        )
+    shares = support_shares(mesh)
+    if shares is not None:
+        supported, weak, smooth, filled = shares.values()
+        yield (
+            f"{supported:.0%} of the surface is supported by three photographs or more, {weak:.0%} by one or two; "
+            f"{smooth:.0%} is seen, but placed by smoothness alone; {filled:.0%} is seen by no photograph."
+        )
+    for rule in built.idle_rules:
+        yield (
+            f"Rule without effect: {rule}. Nothing in the mesh meets its conditions, or later rules take all that does."
+        )
+
+
+def mesh_summary(built: BuiltMesh, figures: MeshFigures, scale: SceneScale | None) -> dict[str, Any]:
+    """Return the entry "mesh" of summary.json: counts, sizes and steps; lengths are in the summary's length_unit."""
+    mesh, solid = built.mesh, built.solid
+    temperature = mesh.temperature_c
+    of_triangles = facet_areas(mesh.points_m, mesh.facets)
+    unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
+    return {
+        "nodes": len(mesh.points_m),
+        "tets": len(mesh.tets),
+        "voxels": int(np.count_nonzero(solid.cells)),
+        "boundary_triangles": len(mesh.facets),
+        "non_manifold_edges": figures.num_non_manifold_edges,
+        "volume": figures.volume_m3,
+        "volume_standard_error": None if scale is None else scale.standard_error_of(figures.volume_m3, 3),
+        "area": figures.area_m2,
+        "area_standard_error": None if scale is None else scale.standard_error_of(figures.area_m2, 2),
+        "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
+        "dihedral_angles_deg": {"min": figures.dihedral_range_deg[0], "max": figures.dihedral_range_deg[1]},
+        "density_threshold_used": solid.threshold,
+        "solid_steps": [
+            {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed, "remark": step.remark}
+            for step in solid.steps
+        ],
+        "parts_without_thermal_rays_left_out": built.unobserved_parts,
+        "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
+        "share_of_nodes_observed": float(np.mean(mesh.observed)),
+        "share_of_area_not_fully_observed": float(unobserved / of_triangles.sum()),
+        "share_of_area_by_support": support_shares(mesh),
+        "rules_without_effect": built.idle_rules,
+        "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles),
+        "regions": _sums(mesh.region_names, mesh.region, signed_volumes(mesh.points_m, mesh.tets)),
+        "temperature_c": None
+        if not mesh.has_temperatures
+        else {
+            "min": float(temperature.min()),
+            "max": float(temperature.max()),
+            "mean_of_nodes": float(temperature.mean()),
+        },
+    }
+
+
+def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
+    """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
+    points, left_out = built.mesh.points_m, int(built.solid.left_out.sum())
+    # Solid voxels in the whole lattice, before regions are left out and interiors are filled.
+    found = sum(step.added for step in built.solid.steps if step.name in ("threshold", "close gaps"))
+    return {
+        "asked_for": asked_for,
+        "size": points.max(axis=0) - points.min(axis=0),
+        "voxels_taken": found - left_out,
+        "voxels_left_out": left_out,
+        "share_of_solid_taken": 1.0 - left_out / found,
+    }
+
+
+def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
+    """Return the sum of `amount`, (k,), over entries with equal `number`, (k,), by name; unused names are left out."""
+    total = np.bincount(number, weights=amount, minlength=len(names))
+    return {names[n]: float(total[n]) for n in np.unique(number)}
+
+
+def support_shares(mesh: TetMesh) -> dict[str, float] | None:
+    """Return the share of the area in each class of `SUPPORT`, without cut triangles; None if support is unknown."""
+    support = support_of_facets(mesh)
+    if support is None or not (support >= 0).any():
+        return None
+    area = facet_areas(mesh.points_m, mesh.facets)
+    total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
+    return dict(zip(SUPPORT, (total / total.sum()).tolist()))
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of the packages that an export depends on."""
+    packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
+    return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}
