@@ -100,25 +100,16 @@ class ExportOptions:
 
 
 @dataclass(frozen=True)
-class Viewpoint:
-    """Direction from which pictures show the mesh, in the coordinates of the input poses."""
-
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up."""
-    up_source: str = "Up is assumed to be z."
-    """Sentence that says how `up` was found."""
-    view_direction: tuple[float, float, float] | None = None
-    """Direction from the picture's camera to the mesh; None: obliquely from above."""
-
-
-@dataclass(frozen=True)
 class TrainedScene:
     """A trained field, and what else an export needs from the training run."""
 
     snapshot: GridSnapshot
     world_to_input: FloatArray
     """Matrix from homogeneous coordinates of the trained scene to coordinates of the input poses, shape (4, 4)."""
-    viewpoint: Viewpoint  # View for pictures, chosen by `viewpoint_of_cameras`
+    up: tuple[float, float, float]  # Direction that points up, in the coordinates of the input poses
+    up_source: str  # Sentence that says how `up` was found
+    view_direction: tuple[float, float, float] | None
+    """Direction from the camera of pictures to the mesh, in the same coordinates; None: obliquely from above."""
     scene_folder: Path  # Path that training took as its scene: a folder, or a json file in a folder
     dataset: Any  # Training photographs, a `ThermalDataset`; None: support of the surface is not counted
     tracks: FeatureRays | None  # Lines from photographs to points that the photographs show, in the trained scene
@@ -213,7 +204,7 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
         got = "none in the options or in the scene's json"
         raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
     metres = 1.0 if scale is None else scale.metres_per_unit
-    up, up_source = run.viewpoint.up, run.viewpoint.up_source
+    up, up_source = run.up, run.up_source
     if options.up is not None:
         x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
         up, up_source = (x, y, z), "Given with --up."
@@ -301,7 +292,7 @@ def _draw(folder: Path, run: TrainedScene, made: SceneMesh) -> None:
     from thermoxels_ns.reports import mesh_pictures
 
     mesh, unit, (every, measured, region, support) = made.built.mesh, made.unit, [folder / name for name in _PICTURES]
-    look = {"up": made.up, "view_direction": run.viewpoint.view_direction}
+    look = {"up": made.up, "view_direction": run.view_direction}
     no_ray: Any = {"painted": [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]}
     for path, title, grey in ((every, "Surface temperature", {}), (measured, "Measured surface temperature", no_ray)):
         image = mesh_pictures.image_of_mesh(mesh, title=title, length_unit=unit, **look, **grey)
@@ -391,7 +382,7 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
     return TrainedScene(
         pipeline.grid_snapshot(),
         world_to_input,
-        viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
+        *viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
         Path(pipeline.datamanager.get_datapath()),
         pipeline.datamanager.train_dataset,
         outputs.metadata["feature_rays"],
@@ -399,8 +390,12 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
     )
 
 
-def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
-    """Choose a view for pictures: up as the photographer held the camera, seen from the side where the cameras stood.
+def viewpoint_of_cameras(
+    camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike
+) -> tuple[tuple[float, float, float], str, tuple[float, float, float] | None]:
+    """Choose `up`, `up_source` and `view_direction` of a `TrainedScene`.
+
+    Up is as the photographer held the camera, and pictures are seen from the side where the cameras stood.
 
     Poses are in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
     around, `view_direction` is None, which means obliquely from above.
@@ -410,7 +405,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     rotation = np.asarray(world_to_input, np.float64)[:3, :3]
     axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])
     if np.linalg.norm(axes[:, :, 1].mean(axis=0)) < 0.1:  # the cameras' up directions cancel out
-        return Viewpoint()
+        return (0.0, 0.0, 1.0), "Up is assumed to be z.", None
     found = find_up(axes, [None] * len(axes), [1] * len(axes))
     up, source = found.direction, found.source
     forward = -axes[:, :, 2].mean(axis=0)
@@ -419,7 +414,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     if np.linalg.norm(level) > 0.3:
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
-    return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
+    return tuple(float(v) for v in up), source, direction  # type: ignore[return-value]
 
 
 def lines_on_mesh(
