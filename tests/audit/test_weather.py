@@ -17,8 +17,7 @@ from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, tabulated
-from thermoxels_ns.fem.runge_kutta import SDIRK2
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 

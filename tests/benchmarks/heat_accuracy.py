@@ -34,10 +34,9 @@ from tests.support.heat_bodies import CONCRETE, finer, nafems_t3
 from tests.support.heat_meshes import planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, solve_heat
 from thermoxels_ns.fem.tolerance import Goals, difference_between, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection
 

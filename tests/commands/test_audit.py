@@ -25,8 +25,7 @@ from thermoxels_ns.commands.audit import Audit, run_audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.reports.audit_page import draw_audit
-from thermoxels_ns.reports.audit_view import view_data
+from thermoxels_ns.reports.audit_page import draw_audit, view_data
 
 GBXML = distribution("xgbxml").locate_file("xgbxml/schemas/GreenBuildingXML_Ver6.01.xsd")
 NAMESPACE = "{http://www.gbxml.org/schema}"

@@ -17,7 +17,6 @@ from thermoxels_ns.commands.export import (
     ExportOptions,
     ExportThermoxelsMesh,
     TrainedScene,
-    Viewpoint,
     check_options,
     export_scene,
     scene_json,
@@ -51,8 +50,9 @@ OPTIONS = {field.name for field in fields(ExportOptions)}
 
 def trained(snapshot: GridSnapshot, **more) -> TrainedScene:
     """A trained field without photographs and without a scene's json."""
-    known = {"world_to_input": np.eye(4), "viewpoint": Viewpoint(), "scene_folder": Path("no/scene"), "dataset": None}
-    return TrainedScene(snapshot, **{**known, "tracks": None, "corrections": {}, **more})
+    known = {"world_to_input": np.eye(4), "up": (0.0, 0.0, 1.0), "up_source": "z", "view_direction": None}
+    known |= {"scene_folder": Path("no/scene"), "dataset": None, "tracks": None, "corrections": {}}
+    return TrainedScene(snapshot, **{**known, **more})
 
 
 def read(folder: Path) -> dict:
@@ -211,7 +211,7 @@ def test_a_region_is_exported_said_and_drawn(ball, tmp_path, drawn) -> None:
 
 
 def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, drawn, truth) -> None:
-    look = Viewpoint(up=(0.0, 1.0, 0.0), view_direction=(0.0, 0.0, -1.0))
+    look = {"up": (0.0, 1.0, 0.0), "view_direction": (0.0, 0.0, -1.0)}
     options = ExportOptions(density_threshold=4.0)
     asked = []
 
@@ -221,11 +221,9 @@ def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, 
         return {"fscore": 0.5}
 
     truth(compare)
-    unscaled = export_scene(trained(ball, viewpoint=look), options, tmp_path)
+    unscaled = export_scene(trained(ball, **look), options, tmp_path)
     assert not asked and "truth" not in unscaled  # a truth is in metres
-    assert {(v["up"], v["view_direction"], v["length_unit"]) for _, v in drawn} == {
-        (look.up, look.view_direction, "input unit")
-    }
+    assert {(v["up"], v["view_direction"], v["length_unit"]) for _, v in drawn} == {(*look.values(), "input unit")}
     export_scene(trained(ball), ExportOptions(density_threshold=4.0, pictures=False, **SCALED), tmp_path)
     assert asked[0][0] > 0 and asked[0][1] > 6 * asked[0][0] and read(tmp_path)["truth"] == {"fscore": 0.5}
 
@@ -316,12 +314,12 @@ def test_summary_says_how_much_of_the_surface_was_measured(ball, tmp_path) -> No
 def test_view_from_where_the_cameras_stood() -> None:
     """Cameras that look along +x with y of the picture along -z (an upside-down world): the picture does too."""
     pose = np.array([[0.0, 0.0, -1.0, -3.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
-    view = viewpoint_of_cameras(np.stack([pose, pose]), np.diag([2.0, 2.0, 2.0, 1.0]))
-    assert view.up == pytest.approx((0.0, 0.0, -1.0)) and view.view_direction is not None
-    assert np.dot(view.view_direction, (1.0, 0.0, 0.0)) == pytest.approx(1.0) and view.view_direction[2] > 0
+    up, _, direction = viewpoint_of_cameras(np.stack([pose, pose]), np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert up == pytest.approx((0.0, 0.0, -1.0)) and direction is not None
+    assert np.dot(direction, (1.0, 0.0, 0.0)) == pytest.approx(1.0) and direction[2] > 0
     turned = pose.copy()
     turned[:, [0, 2]] *= -1.0  # looks back along -x
-    assert viewpoint_of_cameras(np.stack([pose, turned]), np.eye(4)).view_direction is None
+    assert viewpoint_of_cameras(np.stack([pose, turned]), np.eye(4))[2] is None
 
 
 def test_up_of_cameras_that_look_down_is_that_of_their_level_pictures() -> None:
@@ -332,10 +330,10 @@ def test_up_of_cameras_that_look_down_is_that_of_their_level_pictures() -> None:
         ahead = np.array([-np.sin(heading), np.cos(heading), 0.0])
         back = -(0.5 * ahead - np.sqrt(0.75) * np.array([0.0, 0.0, 1.0]))
         poses.append(np.column_stack([right, np.cross(back, right), back, np.zeros(3)]))
-    view = viewpoint_of_cameras(np.stack(poses), np.eye(4))
-    assert view.up == pytest.approx((0.0, 0.0, 1.0), abs=1e-9) and "held level" in view.up_source
-    one_way = viewpoint_of_cameras(np.stack(poses[2:3]), np.eye(4))
-    assert one_way.up == pytest.approx((0.0, np.sqrt(0.75), 0.5)) and "the mean" in one_way.up_source
+    up, source, _ = viewpoint_of_cameras(np.stack(poses), np.eye(4))
+    assert up == pytest.approx((0.0, 0.0, 1.0), abs=1e-9) and "held level" in source
+    up, source, _ = viewpoint_of_cameras(np.stack(poses[2:3]), np.eye(4))
+    assert up == pytest.approx((0.0, np.sqrt(0.75), 0.5)) and "the mean" in source
 
 
 def test_up_can_be_given(small, tmp_path_factory) -> None:

@@ -17,7 +17,7 @@ from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.errors import HeatError, OutputError, ThermoxelsError
-from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.linear_tets import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.run import place_probes
 from thermoxels_ns.heat.scene import load_heat_scene
@@ -249,7 +249,7 @@ def test_a_tolerance_is_met_on_a_finer_mesh_and_everything_is_that_of_it(folder)
     error = np.abs(np.asarray(written.point_data["temperature_c"]) - exact_c)[: len(given.points_m)].max()
     assert error <= 0.5 and 1 / 3 < accuracy["estimated_k"] / error < 3
     assert found["probes"][0]["temperature_c"][0] == pytest.approx(
-        float(place_probes(fine, [(0.5, 2.0, 2.0)]).at(exact_c)[0]), abs=0.5
+        float((place_probes(fine, [(0.5, 2.0, 2.0)]) @ exact_c)[0]), abs=0.5
     )
     assert found["coldest"]["temperature_c"] == pytest.approx(float(written.point_data["temperature_c"].min()))
     # Flows of quadratic tetrahedra agree by effect, by patch, by region and as a wall.

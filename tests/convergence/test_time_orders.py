@@ -6,8 +6,7 @@ import pytest
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, Scheme
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, Scheme, solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 
 DURATION_S = 4 * 3600.0

@@ -5,7 +5,7 @@ import thermoxels_ns
 from tests.support.docs_code import code_in
 from tests.support.heat_matrices import assemble, backward_euler
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.mesh.files.solvers import write_xdmf
+from thermoxels_ns.mesh.files.formats import write_xdmf
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import facet_areas
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from tests.support.docs_code import code_in
-from thermoxels_ns.mesh.files.solvers import write_msh
+from thermoxels_ns.mesh.files.formats import write_msh
 
 pytestmark = pytest.mark.external
 

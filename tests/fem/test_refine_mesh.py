@@ -7,8 +7,7 @@ from scipy.spatial import Delaunay
 from tests.support.heat_matrices import storage
 from tests.support.heat_meshes import box_mesh, mesh_from
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.fem.linear_tets import TET_EDGES, lumped_mass, stiffness_matrix
-from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.linear_tets import TET_EDGES, lumped_mass, refine_mesh, stiffness_matrix
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space, conduction
 from thermoxels_ns.mesh.quality.checks import boundary_facets

@@ -9,9 +9,8 @@ from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

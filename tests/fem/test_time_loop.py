@@ -8,10 +8,9 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Quantity, TimeSteps, Varying, tabulated
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
 from thermoxels_ns.heat.scene_fields import Sun
 

@@ -7,13 +7,13 @@ import pyvista
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.commands.heat import remove_heat_series, write_heat_series
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_results, wall_result
-from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
 

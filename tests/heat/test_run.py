@@ -214,10 +214,8 @@ def test_a_linear_field_is_interpolated_exactly_everywhere(box) -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform([0, 0, -1], [1, 0.5, 0], (200, 3)), box.points_m, [[0.125, 0.0, -0.3]]])
     probes = place_probes(box, points)
-    np.testing.assert_allclose(probes.at(box.temperature_c), linear(points), atol=1e-12)
-    states = np.stack([box.temperature_c, 2.0 * box.temperature_c])
-    np.testing.assert_allclose(probes.at(states), [linear(points), 2.0 * linear(points)], atol=1e-12)
-    assert np.all(probes.weights >= 0.0) and np.allclose(probes.weights.sum(axis=1), 1.0, rtol=1e-14)
+    np.testing.assert_allclose(probes @ box.temperature_c, linear(points), atol=1e-12)
+    assert np.all(probes.data >= 0.0) and np.allclose(probes.sum(axis=1), 1.0, rtol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -239,6 +237,6 @@ def test_a_point_just_beyond_a_slanted_face_is_outside() -> None:
     corner = np.vstack([np.zeros(3), np.eye(3)])
     tet = mesh_from(corner, np.array([[0, 1, 2, 3]]), lambda p: np.arange(4.0))
     on_it = np.full(3, 1.0 / 3.0)
-    assert place_probes(tet, [on_it]).at(tet.temperature_c)[0] == pytest.approx(2.0)
+    assert (place_probes(tet, [on_it]) @ tet.temperature_c)[0] == pytest.approx(2.0)
     with pytest.raises(HeatError, match=r"^probe 1: expected"):
         place_probes(tet, [on_it + 1e-5])

@@ -7,8 +7,8 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
 from thermoxels_ns.mesh.quality.checks import boundary_facets
+from thermoxels_ns.mesh.solid.free_space import FacetViews, facet_views
 from thermoxels_ns.mesh.tetrahedra import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 from thermoxels_ns.multiview.photographs import Photographs

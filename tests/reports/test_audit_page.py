@@ -13,7 +13,7 @@ import pytest
 from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
 from thermoxels_ns.audit.run import asked_of_survey, audit
 from thermoxels_ns.reports import audit_page
-from thermoxels_ns.reports.audit_view import thinned, view_data
+from thermoxels_ns.reports.audit_page import thinned, view_data
 from thermoxels_ns.reports.page import Report, image_file
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

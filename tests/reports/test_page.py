@@ -9,8 +9,7 @@ from PIL import Image
 
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.commands.demo_results import Compared, Target
-from thermoxels_ns.reports.charts import colours
-from thermoxels_ns.reports.page import _environment, build_page
+from thermoxels_ns.reports.page import _environment, build_page, colours
 
 HOSTILE = "<script>alert('1')</script>\"'&"
 

@@ -10,9 +10,8 @@ from tests.support.heat_meshes import box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, H, body, faults, spots
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.runge_kutta import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, Radiation
 from thermoxels_ns.heat.materials import Material
 

@@ -33,10 +33,9 @@ from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying, tabulated
-from thermoxels_ns.fem.runge_kutta import SDIRK2
 from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_results

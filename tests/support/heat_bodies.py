@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import Nodal, box_mesh, mesh_from
+from thermoxels_ns.fem.linear_tets import refine_mesh
 from thermoxels_ns.fem.problem import HeatProblem, Varying
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.heat.effects import FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh

@@ -8,9 +8,8 @@ import pytest
 from tests.support.heat_bodies import nafems_t3
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, Scheme, solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 

@@ -9,9 +9,8 @@ from tests.support.heat_meshes import box_mesh, graded, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import SDIRK2, solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import wall_result

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.mesh.quality.checks import component_of, group_sides, triangles_across_edges
+from thermoxels_ns.mesh.quality.checks import component_of, group_sides
 
 DefectKind = Literal["line", "point", "area"]
 
@@ -157,7 +157,7 @@ def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
 
 def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
     """Return pairs of triangles that share an edge and a patch, as places in `which`, shape (p, 2)."""
-    pairs = triangles_across_edges(group_sides(surface.mesh.facets[which]))
+    pairs = np.stack(group_sides(surface.mesh.facets[which]).pairs(), axis=1) // 3
     patch = surface.selection.facet_patch[which]
     return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]
 

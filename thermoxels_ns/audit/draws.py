@@ -124,10 +124,13 @@ def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
         name: np.concatenate([[what.value], what.low + (what.high - what.low) * spread()])
         for name, what in uncertain(conditions).items()
     }
+    for name, limits in (("wind", (0.0, np.inf)), ("cloud", (0.0, 1.0))):  # what is possible
+        if name in values:
+            values[name] = np.clip(values[name], *limits)
     if FORMULA in causes(conditions):
         reach = np.cumsum(conditions.film_shares)
         values[FORMULA] = np.concatenate([[-1.0], np.searchsorted(reach[:-1], spread(), side="right")])
-    return Draws(_possible(values), seed)
+    return Draws(values, seed)
 
 
 def causes(conditions: Conditions) -> list[str]:
@@ -162,9 +165,3 @@ def uncertain(conditions: Conditions) -> dict[str, Measured]:
 def emissivity_name(conditions: Conditions, number: int) -> str:
     """Return the name that reports use for the emissivity of entry `number`, from 0, of `Conditions.surfaces`."""
     return f"emissivity of {', '.join(conditions.surfaces[number].patches)}, entry {number + 1}"
-
-
-def _possible(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """Clip draws to possible values: wind to 0 or more, and the share of clouds to 0 to 1."""
-    limits = {"wind": (0.0, np.inf), "cloud": (0.0, 1.0)}
-    return {name: np.clip(drawn, *limits[name]) if name in limits else drawn for name, drawn in values.items()}

@@ -484,12 +484,8 @@ def _check_film(conditions: Conditions, surface: AuditedSurface, draws: Draws, p
     balance = replace(conditions, film=Film(factor=conditions.film.factor))
     flow_w = surface.area_m2 * triangle_exchange(balance, surface, draws).flow_w_m2
     for one in failing:
-        patch = surface.selection.patch_names.index(one.name)
-        u = (
-            flow_w[surface.counted & (surface.selection.facet_patch == patch)].sum()
-            / one.area_m2
-            / draws.difference_k[0]
-        )
+        on = surface.selection.facet_patch == surface.selection.patch_names.index(one.name)
+        u = flow_w[surface.counted & on].sum() / one.area_m2 / draws.difference_k[0]
         if u > 0.0:
             expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
             got = f"{chosen}, by which {one.name} has a U-value of {one.u_w_m2k.value:.2f}; by the balance, {u:.2f}"

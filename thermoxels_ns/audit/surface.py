@@ -57,7 +57,6 @@ class AuditedSurface:
     why_not: IntArray  # Place in `WHY_NOT` of the reason why a triangle does not count, shape (f,); -1 if it counts
     unsupported: BoolArray  # True for triangles that count but whose position no photograph supports, shape (f,)
     surface_entry: IntArray  # Place in `Conditions.surfaces` of the triangle's emissivity, shape (f,); -1: none
-    base_m: float  # Coordinate of the lowest node of the mesh along `selection.up`, [m]
 
     @property
     def mesh(self) -> TetMesh:
@@ -69,10 +68,11 @@ class AuditedSurface:
         """Upward part of each triangle's unit normal, shape (f,)."""
         return self.selection.facet_normal @ np.array(self.selection.up)
 
-    @property
+    @cached_property
     def height_m(self) -> FloatArray:
         """Height of each triangle above the lowest node of the mesh, shape (f,), [m]."""
-        return self.centroid_m @ np.array(self.selection.up) - self.base_m
+        up = np.array(self.selection.up)
+        return self.centroid_m @ up - (self.mesh.points_m @ up).min()
 
     @property
     def read(self) -> BoolArray:
@@ -183,5 +183,4 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
         why_not=why_not,
         unsupported=unsupported & counted,
         surface_entry=entry_of_patch[patch],
-        base_m=float((mesh.points_m @ np.array(up)).min()),
     )

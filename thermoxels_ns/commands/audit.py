@@ -324,8 +324,6 @@ def _write(
     compared: Comparison | None,
 ) -> tuple[str, ...]:
     """Write all files and return their names."""
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
     from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
@@ -338,17 +336,12 @@ def _write(
     earlier = options.compare and options.compare.with_name(SURFACE)
     more = [options.patches, options.compare, earlier, *(Path(one) for one in series if one)]
     north = options.north if options.envelope else None
-    report = identify(
-        (*inputs, *filter(None, more)),
-        options.up,
-        options.least_bridge_w,
-        north,
-        *filter(None, [options.compare_difference]),
-    )
+    choices = options.up, options.least_bridge_w, north, *filter(None, [options.compare_difference])
+    report = identify((*inputs, *filter(None, more)), *choices)
     answers = answers_of(options, found, envelope, compared) | {"report": asdict(report)}
     plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
-    write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
+    write_vtk(folder / SURFACE, found.to_pyvista())
     title = found.conditions.title
     for kind, name in ENVELOPES.items():
         if envelope is None or kind not in options.envelope:

@@ -13,8 +13,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.audit_page import MOST_DEFECTS
-from thermoxels_ns.reports.charts import colours
-from thermoxels_ns.reports.page import Picture, image_file
+from thermoxels_ns.reports.page import Picture, colours, image_file
 
 _MOST_POINTS = 1000  # Most triangles of a defect that are projected into photographs
 _CELLS = 64  # Cells across and along a photograph; in each cell the nearest triangle hides farther ones

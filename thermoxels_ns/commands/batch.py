@@ -12,7 +12,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from importlib.util import find_spec
@@ -104,54 +104,53 @@ class Batch:
 
     def main(self) -> None:
         """Run all stages, and write the page; raises `ThermoxelsError` if any building is not finished."""
-        run_batch(self, partial(print, flush=True))
+        from thermoxels_ns.reports.page import build_page, write_page
 
-
-def run_batch(batch: Batch, say: Callable[[str], None]) -> None:
-    """Run a `Batch`: read the list, start Snakemake, and write the page over all buildings."""
-    if batch.cores < 1 or not (batch.memory_gb is None or 0.0 < batch.memory_gb < math.inf):
-        got, remedy = f"{batch.cores} and {batch.memory_gb} GB", "Leave them out for the defaults."
-        raise ThermoxelsError("batch", expected="at least one processor and some memory", got=got, remedy=remedy)
-    buildings = read_list(batch.list)
-    if find_spec("snakemake") is None:
-        remedy = "Install it, with Python 3.11 or newer: pip install 'snakemake>=9'"
-        raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
-    folder = writable_folder(batch.output_dir).resolve()
-    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", say) as lock:
-        write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
-        for note in () if batch.dry_run else folder.glob("*/logs/*.failed.json"):
-            remove_file(note)  # of an earlier start
-        command = [
-            *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
-            *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
-            *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
-            *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "params", "--nolock"),
-            *(() if batch.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * batch.memory_gb)}")),
-            *(("--executor", batch.executor) if batch.executor else ()),
-            *(("--dry-run",) if batch.dry_run else ("--quiet", "rules")),
-        ]
-        say(f"$ {shlex.join(command)}")
-        # Snakemake inherits the lock: while it runs, also without this process, no other batch begins in the folder.
-        held = lock._context.lock_file_fd
-        process = subprocess.Popen(command, pass_fds=[held] if held is not None and os.name == "posix" else [])
-        try:
-            process.wait()
-        except KeyboardInterrupt:
-            process.wait()  # it ends its jobs, also those on a cluster
-            raise
-        rows = [] if batch.dry_run else [_row(folder, name, building) for name, building in buildings.items()]
-        if process.returncode and not any(row["failed"] for row in rows):
-            remedy = "Its output says why."
-            raise ThermoxelsError("snakemake", expected="exit status 0", got=process.returncode, remedy=remedy)
-        if batch.dry_run:
-            return
-        _write_page(folder / PAGE, rows)
-    say(f"All buildings: {folder / PAGE}")
-    missing = [row for row in rows if not row["finished"]]
-    if missing:
-        got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])
-        remedy = f"Correct what {folder / PAGE} names; the same command then goes on."
-        raise ThermoxelsError("batch", expected=f"{len(rows)} buildings finished", got=got, remedy=remedy)
+        say = partial(print, flush=True)
+        if self.cores < 1 or not (self.memory_gb is None or 0.0 < self.memory_gb < math.inf):
+            got, remedy = f"{self.cores} and {self.memory_gb} GB", "Leave them out for the defaults."
+            raise ThermoxelsError("batch", expected="at least one processor and some memory", got=got, remedy=remedy)
+        buildings = read_list(self.list)
+        if find_spec("snakemake") is None:
+            remedy = "Install it, with Python 3.11 or newer: pip install 'snakemake>=9'"
+            raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
+        folder = writable_folder(self.output_dir).resolve()
+        with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", say) as lock:
+            write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
+            for note in () if self.dry_run else folder.glob("*/logs/*.failed.json"):
+                remove_file(note)  # of an earlier start
+            command = [
+                *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
+                *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
+                *("--cores" if not self.executor else "--jobs", str(self.cores)),
+                *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "params", "--nolock"),
+                *(() if self.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * self.memory_gb)}")),
+                *(("--executor", self.executor) if self.executor else ()),
+                *(("--dry-run",) if self.dry_run else ("--quiet", "rules")),
+            ]
+            say(f"$ {shlex.join(command)}")
+            # Snakemake inherits the lock: while it runs, also without this process, no other batch begins here.
+            held = lock._context.lock_file_fd
+            process = subprocess.Popen(command, pass_fds=[held] if held is not None and os.name == "posix" else [])
+            try:
+                process.wait()
+            except KeyboardInterrupt:
+                process.wait()  # it ends its jobs, also those on a cluster
+                raise
+            rows = [] if self.dry_run else [_row(folder, name, building) for name, building in buildings.items()]
+            if process.returncode and not any(row["failed"] for row in rows):
+                remedy = "Its output says why."
+                raise ThermoxelsError("snakemake", expected="exit status 0", got=process.returncode, remedy=remedy)
+            if self.dry_run:
+                return
+            rows.sort(key=lambda one: (one["finished"], -((one["loss_w"] or {}).get("value") or 0.0), one["name"]))
+            write_page(folder / PAGE, build_page("batch.html.j2", rows=rows, stages=list(STAGES)))
+        say(f"All buildings: {folder / PAGE}")
+        missing = [row for row in rows if not row["finished"]]
+        if missing:
+            got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])
+            remedy = f"Correct what {folder / PAGE} names; the same command then goes on."
+            raise ThermoxelsError("batch", expected=f"{len(rows)} buildings finished", got=got, remedy=remedy)
 
 
 def read_list(path: Path) -> dict[str, Building]:
@@ -184,7 +183,11 @@ def read_list(path: Path) -> dict[str, Building]:
         mistakes += [] if _KNOWN_NAME.fullmatch(one.name) else [f"name {one.name!r} is not of letters, digits, - and _"]
         mistakes += [f"name {one.name!r} is there twice"] if one.name in buildings else []
         mistakes += ["needs either photographs or a scene"] if bool(one.photographs) == bool(one.scene) else []
-        mistakes += _unknown_heat(one.heat)
+        if one.heat and not one.heat.endswith((".yaml", ".yml")):
+            from thermoxels_ns.heat.scene import heat_scene_names
+
+            if one.heat not in (scenes := heat_scene_names()):
+                mistakes.append(f"heat: {one.heat!r} is neither a .yaml file nor one of {', '.join(scenes)}")
         for name in ("train", "export"):
             try:
                 shlex.split(getattr(one, name))
@@ -204,15 +207,6 @@ _PLACES = {
     **{"photographs": Path.is_dir, "scene": Path.exists},
     **{"patches": Path.is_file, "conditions": Path.is_file, "heat": Path.is_file},
 }
-
-
-def _unknown_heat(heat: str) -> list[str]:
-    if not heat or heat.endswith((".yaml", ".yml")):
-        return []
-    from thermoxels_ns.heat.scene import heat_scene_names
-
-    known = heat_scene_names()
-    return [] if heat in known else [f"heat: {heat!r} is neither a .yaml file nor one of {', '.join(known)}"]
 
 
 def read_batch(folder: Path) -> dict[str, Building]:
@@ -316,13 +310,6 @@ def _read(path: Path) -> dict[str, Any]:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-
-
-def _write_page(path: Path, rows: list[dict[str, Any]]) -> None:
-    from thermoxels_ns.reports.page import build_page, write_page
-
-    rows = sorted(rows, key=lambda row: (row["finished"], -((row["loss_w"] or {}).get("value") or 0.0), row["name"]))
-    write_page(path, build_page("batch.html.j2", rows=rows, stages=list(STAGES)))
 
 
 def _end(*_: Any) -> NoReturn:

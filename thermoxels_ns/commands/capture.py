@@ -31,9 +31,21 @@ class Capture(CaptureSettings):
     poses and rig are kept where nothing that they depend on has changed, and the scene is written anew."""
 
     def main(self) -> None:
-        """Run the capture; raises `ThermoxelsError` for unusable files or options, and without pairs or poses."""
+        """Run the capture and print what was left out; raises `ThermoxelsError` if nothing can be made of the files."""
         result = capture_folder(self.source, self.output, self, partial(print, flush=True))
-        _print_result(result, self.output)
+        print(f"{len(result.scene.frames)} frames of {len(result.pairs)} pairs are in the scene.")
+        if result.dropped:
+            print(f"Left out: {len(result.dropped)}")
+            for name, why in list(result.dropped.items())[:_LISTED]:
+                print(f"  {name}: {why}")
+            if len(result.dropped) > _LISTED:
+                print(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
+        if not result.scene.rig.determined:
+            print(f"The rig was not determined. {result.scene.rig.explanation}")
+        if result.scene.scale is None:
+            print(f"The scale is unknown: {result.scale_missing}. Give a length when you export.")
+        print(f"What was found, with pictures to judge it by: {result.page}")
+        print(f"Train with: ns-train thermoxels --data {shlex.quote(str(self.output))}")
 
 
 def capture_folder(
@@ -44,20 +56,3 @@ def capture_folder(
     from thermoxels_ns.reports.capture_page import write_capture_page
 
     return run_capture(source, output, settings, write_capture_page, say)
-
-
-def _print_result(result: CaptureResult, folder: Path) -> None:
-    """Print the numbers of frames and pairs, what was left out and why, and the next command."""
-    print(f"{len(result.scene.frames)} frames of {len(result.pairs)} pairs are in the scene.")
-    if result.dropped:
-        print(f"Left out: {len(result.dropped)}")
-        for name, why in list(result.dropped.items())[:_LISTED]:
-            print(f"  {name}: {why}")
-        if len(result.dropped) > _LISTED:
-            print(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
-    if not result.scene.rig.determined:
-        print(f"The rig was not determined. {result.scene.rig.explanation}")
-    if result.scene.scale is None:
-        print(f"The scale is unknown: {result.scale_missing}. Give a length when you export.")
-    print(f"What was found, with pictures to judge it by: {result.page}")
-    print(f"Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")

@@ -34,55 +34,50 @@ class Demo:
 
     def main(self) -> None:
         """Run the demo; raises `ThermoxelsError` if a command fails, a target is missed, or the folder is in use."""
-        run_demo(self)
+        from thermoxels_ns.commands.demo_results import audit_target, compare, demo_page, read_results
+        from thermoxels_ns.core.yaml_records import configs_folder
+        from thermoxels_ns.reports.page import write_page
+        from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
+        folder = prepare_folder(self.output_dir)
+        logs = writable_folder(folder / "logs")
+        commands = demo_commands(folder)
+        patches = folder / "survey" / "patches.yaml"
+        seconds: list[tuple[str, float]] = []
 
-def run_demo(demo: Demo) -> None:
-    """Run all steps of a `Demo`, and write its page."""
-    from thermoxels_ns.commands.demo_results import audit_target, compare, demo_page, read_results
-    from thermoxels_ns.core.yaml_records import configs_folder
-    from thermoxels_ns.reports.page import write_page
-    from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+        @contextmanager
+        def step(name: str) -> Iterator[None]:
+            """Announce a step and append the seconds that its body takes to `seconds`."""
+            print(f"\n{len(seconds) + 1}/{len(commands) + 2}  {name}", flush=True)
+            start = time.monotonic()
+            yield
+            seconds.append((name, time.monotonic() - start))
 
-    folder = prepare_folder(demo.output_dir)
-    logs = writable_folder(folder / "logs")
-    commands = demo_commands(folder)
-    patches = folder / "survey" / "patches.yaml"
-    seconds: list[tuple[str, float]] = []
+        photograph = shlex.join(["thermoxels", "synthetic", _SCENE, "--output-dir", str(folder / "scene")])
+        with step("Photograph the synthetic scene"):
+            print(f"$ {photograph}", flush=True)
+            write_scene(make_scene(_SCENE), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
+            for name in ("patches.yaml", "conditions.yaml"):
+                shutil.copyfile(configs_folder() / f"{_SCENE}-{name}", writable_folder(patches.parent) / name)
+        for name, command in commands.items():
+            with step(name):
+                log = logs / f"{command[1] if command[0] == 'thermoxels' else command[0]}.log"
+                run_command(command, log.with_stem(f"{log.stem}-walls") if log.exists() else log, sys.stdout)
+        with step("Compare with the truth"):
+            targets = read_results(folder / "eval.json", folder / "export" / "summary.json")
+            compared = compare(folder / "audit" / "answers.json", patches)
+            targets += (audit_target(compared),)
+            for one in targets:
+                print(f"{one.name}: {one.measured_text}, target {one.bound_text}, {'met' if one.met else 'not met'}")
 
-    @contextmanager
-    def step(name: str) -> Iterator[None]:
-        """Announce a step and append the seconds that its body takes to `seconds`."""
-        print(f"\n{len(seconds) + 1}/{len(commands) + 2}  {name}", flush=True)
-        start = time.monotonic()
-        yield
-        seconds.append((name, time.monotonic() - start))
-
-    photograph = shlex.join(["thermoxels", "synthetic", _SCENE, "--output-dir", str(folder / "scene")])
-    with step("Photograph the synthetic scene"):
-        print(f"$ {photograph}", flush=True)
-        write_scene(make_scene(_SCENE), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
-        for name in ("patches.yaml", "conditions.yaml"):
-            shutil.copyfile(configs_folder() / f"{_SCENE}-{name}", writable_folder(patches.parent) / name)
-    for name, command in commands.items():
-        with step(name):
-            log = logs / f"{command[1] if command[0] == 'thermoxels' else command[0]}.log"
-            run_command(command, log.with_stem(f"{log.stem}-walls") if log.exists() else log, sys.stdout)
-    with step("Compare with the truth"):
-        targets = read_results(folder / "eval.json", folder / "export" / "summary.json")
-        compared = compare(folder / "audit" / "answers.json", patches)
-        targets += (audit_target(compared),)
-        for one in targets:
-            print(f"{one.name}: {one.measured_text}, target {one.bound_text}, {'met' if one.met else 'not met'}")
-
-    index, shown = folder / "index.html", [photograph, *map(shlex.join, commands.values())]
-    page = demo_page(folder, targets, compared, seconds, shown)
-    write_page(index, page)
-    print(f"All pictures and figures: {index}")
-    missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
-    if missed:
-        remedy = f"See {index} for pictures."
-        raise ThermoxelsError("demo", expected="every target met", got="; ".join(missed), remedy=remedy)
+        index, shown = folder / "index.html", [photograph, *map(shlex.join, commands.values())]
+        page = demo_page(folder, targets, compared, seconds, shown)
+        write_page(index, page)
+        print(f"All pictures and figures: {index}")
+        missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
+        if missed:
+            remedy = f"See {index} for pictures."
+            raise ThermoxelsError("demo", expected="every target met", got="; ".join(missed), remedy=remedy)
 
 
 def prepare_folder(path: Path) -> Path:

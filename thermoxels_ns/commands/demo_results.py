@@ -17,8 +17,7 @@ from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json, read_json_object
 from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
-from thermoxels_ns.reports.charts import colours, gradient
-from thermoxels_ns.reports.page import build_page, image_file
+from thermoxels_ns.reports.page import build_page, colours, gradient, image_file
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
 
 _AGAIN = "Run the demo again."

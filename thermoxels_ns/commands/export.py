@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-from collections.abc import Callable, Iterable, Mapping
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,18 +15,21 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
-from thermoxels_ns.core.lattice import Lattice, input_from_world
+from thermoxels_ns.core.lattice import input_from_world
+from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.scene_scale import (
     SceneScale,
     choose_scale,
     scale_from_known_distance,
     up_from_scene_file,
 )
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, facet_normals, support_of_facets
 
 if TYPE_CHECKING:
     from thermoxels_ns.core.feature_rays import FeatureRays
@@ -95,25 +100,16 @@ class ExportOptions:
 
 
 @dataclass(frozen=True)
-class Viewpoint:
-    """Direction from which pictures show the mesh, in the coordinates of the input poses."""
-
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up."""
-    up_source: str = "Up is assumed to be z."
-    """Sentence that says how `up` was found."""
-    view_direction: tuple[float, float, float] | None = None
-    """Direction from the picture's camera to the mesh; None: obliquely from above."""
-
-
-@dataclass(frozen=True)
 class TrainedScene:
     """A trained field, and what else an export needs from the training run."""
 
     snapshot: GridSnapshot
     world_to_input: FloatArray
     """Matrix from homogeneous coordinates of the trained scene to coordinates of the input poses, shape (4, 4)."""
-    viewpoint: Viewpoint  # View for pictures, chosen by `viewpoint_of_cameras`
+    up: tuple[float, float, float]  # Direction that points up, in the coordinates of the input poses
+    up_source: str  # Sentence that says how `up` was found
+    view_direction: tuple[float, float, float] | None
+    """Direction from the camera of pictures to the mesh, in the same coordinates; None: obliquely from above."""
     scene_folder: Path  # Path that training took as its scene: a folder, or a json file in a folder
     dataset: Any  # Training photographs, a `ThermalDataset`; None: support of the surface is not counted
     tracks: FeatureRays | None  # Lines from photographs to points that the photographs show, in the trained scene
@@ -181,36 +177,6 @@ def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, S
     return selection, PatchRules() if options.patches is None else load_patch_rules(options.patches), distance
 
 
-def scale_of(options: ExportOptions, distance: SceneScale | None, scene_file: Mapping) -> SceneScale | None:
-    """Return the scale of an export: from the options, or else from the scene's json; None if neither has a scale.
-
-    Raises `ThermoxelsError` for a scale out of range, or if a format or an option needs a scale and there is none.
-    """
-    scale = choose_scale(options.metres_per_unit, distance, scene_file)
-    asked = {
-        "--formats inp": "inp" in options.formats,
-        "--wall-thickness": options.wall_thickness is not None,
-        "--patches": options.patches is not None,
-    }
-    needs = [option for option, given in asked.items() if given]
-    if scale is None and needs:
-        remedy = "Pass --metres-per-unit, or --known-distance."
-        got = "none in the options or in the scene's json"
-        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
-    return scale
-
-
-def up_of(
-    options: ExportOptions, scene_file: Mapping[str, Any], viewpoint: Viewpoint
-) -> tuple[tuple[float, float, float], str]:
-    """Return the unit vector up and a sentence on its source: --up, else the scene's json, else `viewpoint`."""
-    if options.up is not None:
-        x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
-        return (x, y, z), "Given with --up."
-    in_file = up_from_scene_file(scene_file)
-    return (viewpoint.up, viewpoint.up_source) if in_file is None else (in_file, "From the scene's json.")
-
-
 def prepare_folder(output_dir: Path | str) -> Path:
     """Make an export's folder, without half-written files; raises `OutputError` if it holds files of others."""
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
@@ -230,14 +196,25 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
 
     selection, rules, distance = check_options(options)
     scene_file, lattice = scene_json(run.scene_folder), run.snapshot.lattice
-    scale = scale_of(options, distance, scene_file)
+    scale = choose_scale(options.metres_per_unit, distance, scene_file)
+    needs = ["--formats inp"] * ("inp" in options.formats) + ["--wall-thickness"] * (options.wall_thickness is not None)
+    needs += ["--patches"] * (options.patches is not None)
+    if scale is None and needs:
+        remedy = "Pass --metres-per-unit, or --known-distance."
+        got = "none in the options or in the scene's json"
+        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
     metres = 1.0 if scale is None else scale.metres_per_unit
-    up, up_source = up_of(options, scene_file, run.viewpoint)
+    up, up_source = run.up, run.up_source
+    if options.up is not None:
+        x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
+        up, up_source = (x, y, z), "Given with --up."
+    elif (in_file := up_from_scene_file(scene_file)) is not None:
+        up, up_source = in_file, "From the scene's json."
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
     built = build_mesh(run.snapshot, selection, to_mesh, options.boundary, up=up, rules=rules, metres_per_unit=metres)
     depths = None if run.dataset is None else depths_of_dataset(run.dataset, 0.0, lattice.lo, lattice.hi)
     if depths is not None:
-        built = with_support(built, depths, run.tracks, lattice, to_mesh)
+        built = with_support(built, depths, run, to_mesh)
     unit = "input unit" if scale is None else "m"
     return SceneMesh(built, check_mesh(built.mesh), scale, unit, to_mesh, up, up_source)
 
@@ -254,10 +231,7 @@ def export_scene(
     Raises:
         ThermoxelsError: An option is wrong, nothing is solid, or a file cannot be written.
     """
-    from thermoxels_ns.commands import export_summary
-    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
-    from thermoxels_ns.mesh.files.solvers import check_start
-    from thermoxels_ns.mesh.tetrahedra import support_of_facets
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_start, write_mesh
 
     check_options(options)
     folder = prepare_folder(output_dir)
@@ -269,8 +243,8 @@ def export_scene(
     voxel_size = run.snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(made.to_mesh[:3, :3]))))
     say(f"Up: {', '.join(f'{value:.3g}' for value in made.up)}. {made.up_source}")
     asked_for = "near a point" if options.region_near else "a box" if options.region_box else options.region
-    region = export_summary.region_summary(made.built, asked_for)
-    for line in export_summary.lines_on_mesh(made.built, region, figures.volume_m3, unit, voxel_size):
+    region = region_summary(made.built, asked_for)
+    for line in lines_on_mesh(made.built, region, figures.volume_m3, unit, voxel_size):
         say(line)
     if options.boundary == "voxel":
         say(
@@ -286,13 +260,13 @@ def export_scene(
         files += _PICTURES[: 3 if support_of_facets(mesh) is None else 4]
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(ExportOptions)},
-        "versions": export_summary.versions(),
+        "versions": versions(),
         "length_unit": unit,
         "scale": None if made.scale is None else asdict(made.scale),
         "up": made.up,
         "up_source": made.up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(made.built, figures, made.scale),
+        "mesh": mesh_summary(made.built, figures, made.scale),
         "corrections": run.corrections,
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
@@ -315,12 +289,14 @@ def export_scene(
 def _draw(folder: Path, run: TrainedScene, made: SceneMesh) -> None:
     """Draw the pictures of a mesh into a folder."""
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
 
     mesh, unit, (every, measured, region, support) = made.built.mesh, made.unit, [folder / name for name in _PICTURES]
-    look = {"up": made.up, "view_direction": run.viewpoint.view_direction}
-    mesh_pictures.draw_mesh([every, measured], mesh, look, unit)
+    look = {"up": made.up, "view_direction": run.view_direction}
+    no_ray: Any = {"painted": [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]}
+    for path, title, grey in ((every, "Surface temperature", {}), (measured, "Measured surface temperature", no_ray)):
+        image = mesh_pictures.image_of_mesh(mesh, title=title, length_unit=unit, **look, **grey)
+        mesh_pictures.write_picture(path, image)
     if support_of_facets(mesh) is not None:
         mesh_pictures.draw_support(support, mesh, look)
     # Faces of the voxels that are not exported are drawn in grey.
@@ -338,29 +314,22 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
 
 
-def with_support(
-    built: BuiltMesh,
-    depths: Depths,
-    tracks: FeatureRays | None,
-    lattice: Lattice,
-    to_mesh: FloatArray,
-) -> BuiltMesh:
+def with_support(built: BuiltMesh, depths: Depths, run: TrainedScene, to_mesh: FloatArray) -> BuiltMesh:
     """Return `built` with the numbers of photographs that see and that support each boundary triangle.
 
     See `facet_views` and `supporting_photographs`. Matrix `to_mesh`, (4, 4), leads from the trained scene to the mesh.
     """
-    from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.mesh.tetrahedra import facet_normals
+    from thermoxels_ns.mesh.solid.free_space import facet_views
     from thermoxels_ns.multiview.votes import supporting_photographs
 
-    mesh = built.mesh
+    mesh, lattice = built.mesh, run.snapshot.lattice
     middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
     normal = facet_normals(mesh.points_m, mesh.facets) @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
     photographs = depths.photographs
     cameras = photographs.matrices, photographs.centres, photographs.sizes
     views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
-    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, tracks)
+    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, run.tracks)
     count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
     return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
 
@@ -413,7 +382,7 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
     return TrainedScene(
         pipeline.grid_snapshot(),
         world_to_input,
-        viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
+        *viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
         Path(pipeline.datamanager.get_datapath()),
         pipeline.datamanager.train_dataset,
         outputs.metadata["feature_rays"],
@@ -421,8 +390,12 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
     )
 
 
-def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
-    """Choose a view for pictures: up as the photographer held the camera, seen from the side where the cameras stood.
+def viewpoint_of_cameras(
+    camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike
+) -> tuple[tuple[float, float, float], str, tuple[float, float, float] | None]:
+    """Choose `up`, `up_source` and `view_direction` of a `TrainedScene`.
+
+    Up is as the photographer held the camera, and pictures are seen from the side where the cameras stood.
 
     Poses are in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
     around, `view_direction` is None, which means obliquely from above.
@@ -432,7 +405,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     rotation = np.asarray(world_to_input, np.float64)[:3, :3]
     axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])
     if np.linalg.norm(axes[:, :, 1].mean(axis=0)) < 0.1:  # the cameras' up directions cancel out
-        return Viewpoint()
+        return (0.0, 0.0, 1.0), "Up is assumed to be z.", None
     found = find_up(axes, [None] * len(axes), [1] * len(axes))
     up, source = found.direction, found.source
     forward = -axes[:, :, 2].mean(axis=0)
@@ -441,4 +414,120 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     if np.linalg.norm(level) > 0.3:
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
-    return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
+    return tuple(float(v) for v in up), source, direction  # type: ignore[return-value]
+
+
+def lines_on_mesh(
+    built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
+) -> Iterator[str]:
+    """Yield lines on each step to the solid, and on the mesh; `region` is `region_summary`, lengths are in `unit`."""
+    for step in built.solid.steps:
+        amounts = []
+        for sign, voxels in (("+", step.added), ("-", step.removed)):
+            volume_m3 = voxels * voxel_size**3
+            told = f"{1e3 * volume_m3:.3g} l" if volume_m3 < 1.0 else f"{volume_m3:.3g} m^3"
+            size = f" ({told})" if unit == "m" else ""
+            if voxels:
+                amounts.append(f"{sign}{voxels} voxels{size}")
+        changed = ", ".join(amounts) or "nothing changed"
+        if step.name == "region":
+            size = " x ".join(f"{side:.3g}" for side in region["size"])
+            share, name = region["share_of_solid_taken"], region["asked_for"]
+            yield f"Region, {name}: {size} {unit}, {share:.1%} of the solid; {changed}. {step.remark}"
+        else:
+            yield f"Solid, {step.name}: {changed}. {step.remark}"
+    mesh = built.mesh
+    yield f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3"
+    if built.unobserved_parts:
+        yield (
+            f"Left out because no thermal ray saw them: {built.unobserved_parts} parts of the mesh, "
+            f"{built.unobserved_voxels} voxels in all."
+        )
+    shares = support_shares(mesh)
+    if shares is not None:
+        supported, weak, smooth, filled = shares.values()
+        yield (
+            f"{supported:.0%} of the surface is supported by three photographs or more, {weak:.0%} by one or two; "
+            f"{smooth:.0%} is seen, but placed by smoothness alone; {filled:.0%} is seen by no photograph."
+        )
+    for rule in built.idle_rules:
+        yield (
+            f"Rule without effect: {rule}. Nothing in the mesh meets its conditions, or later rules take all that does."
+        )
+
+
+def mesh_summary(built: BuiltMesh, figures: MeshFigures, scale: SceneScale | None) -> dict[str, Any]:
+    """Return the entry "mesh" of summary.json: counts, sizes and steps; lengths are in the summary's length_unit."""
+    mesh, solid = built.mesh, built.solid
+    temperature = mesh.temperature_c
+    of_triangles = facet_areas(mesh.points_m, mesh.facets)
+    unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
+    return {
+        "nodes": len(mesh.points_m),
+        "tets": len(mesh.tets),
+        "voxels": int(np.count_nonzero(solid.cells)),
+        "boundary_triangles": len(mesh.facets),
+        "non_manifold_edges": figures.num_non_manifold_edges,
+        "volume": figures.volume_m3,
+        "volume_standard_error": None if scale is None else scale.standard_error_of(figures.volume_m3, 3),
+        "area": figures.area_m2,
+        "area_standard_error": None if scale is None else scale.standard_error_of(figures.area_m2, 2),
+        "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
+        "dihedral_angles_deg": {"min": figures.dihedral_range_deg[0], "max": figures.dihedral_range_deg[1]},
+        "density_threshold_used": solid.threshold,
+        "solid_steps": [
+            {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed, "remark": step.remark}
+            for step in solid.steps
+        ],
+        "parts_without_thermal_rays_left_out": built.unobserved_parts,
+        "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
+        "share_of_nodes_observed": float(np.mean(mesh.observed)),
+        "share_of_area_not_fully_observed": float(unobserved / of_triangles.sum()),
+        "share_of_area_by_support": support_shares(mesh),
+        "rules_without_effect": built.idle_rules,
+        "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles),
+        "regions": _sums(mesh.region_names, mesh.region, signed_volumes(mesh.points_m, mesh.tets)),
+        "temperature_c": None
+        if not mesh.has_temperatures
+        else {
+            "min": float(temperature.min()),
+            "max": float(temperature.max()),
+            "mean_of_nodes": float(temperature.mean()),
+        },
+    }
+
+
+def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
+    """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
+    points, left_out = built.mesh.points_m, int(built.solid.left_out.sum())
+    # Solid voxels in the whole lattice, before regions are left out and interiors are filled.
+    found = sum(step.added for step in built.solid.steps if step.name in ("threshold", "close gaps"))
+    return {
+        "asked_for": asked_for,
+        "size": points.max(axis=0) - points.min(axis=0),
+        "voxels_taken": found - left_out,
+        "voxels_left_out": left_out,
+        "share_of_solid_taken": 1.0 - left_out / found,
+    }
+
+
+def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
+    """Return the sum of `amount`, (k,), over entries with equal `number`, (k,), by name; unused names are left out."""
+    total = np.bincount(number, weights=amount, minlength=len(names))
+    return {names[n]: float(total[n]) for n in np.unique(number)}
+
+
+def support_shares(mesh: TetMesh) -> dict[str, float] | None:
+    """Return the share of the area in each class of `SUPPORT`, without cut triangles; None if support is unknown."""
+    support = support_of_facets(mesh)
+    if support is None or not (support >= 0).any():
+        return None
+    area = facet_areas(mesh.points_m, mesh.facets)
+    total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
+    return dict(zip(SUPPORT, (total / total.sum()).tolist()))
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of the packages that an export depends on."""
+    packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
+    return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}

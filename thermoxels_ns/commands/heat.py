@@ -7,25 +7,31 @@ import csv
 import math
 import time as clock
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from xml.etree import ElementTree
 
 import numpy as np
 import tyro
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
-from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder, writable_folder
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
 
 if TYPE_CHECKING:
+    from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.run import HeatRun
+    from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
 """Files that a run writes beside its pictures."""
+STEP_PATTERN = "step-*.vtu"  # Names of the files of a series
 EXAMPLE = "scene-all-effects.yaml"
 
 Say = Callable[[str], None]
@@ -94,7 +100,6 @@ class Heat:
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     """Compute a heat run, write all of its files and return it; answers.json marks a complete folder, so comes last."""
-    from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
     names, series = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY), f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
@@ -105,16 +110,19 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
 
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
-    """Read mesh and scene and compute the heat run of `run_heat`, without writing files."""
+    """Read mesh and scene, `HeatError` if one is missing, and compute the heat run, without writing files."""
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
     from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
 
     begin = clock.perf_counter()
-    mesh_file, scene_file = _given(options)
+    if options.mesh is None or options.scene is None:
+        missing = "mesh" if options.mesh is None else "scene"
+        remedy = "Pass the mesh.vtu of an export, and --scene winter-night; --write-scene writes one to change."
+        raise HeatError(missing, expected="a file", got="none", remedy=remedy)
     behind = None if options.from_audit is None else resistances_of_audit(options.from_audit, say)
-    scene = load_heat_scene(scene_file)
+    scene = load_heat_scene(options.scene)
     goals = Goals(
         tolerance_k=options.tolerance,
         flow_tolerance=options.flow_tolerance,
@@ -122,23 +130,14 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         memory_gb=options.memory_gb,
         allow_unmet=options.allow_unmet,
     )
-    mesh = read_mesh(mesh_file)
-    export = read_export_summary(mesh_file, say)
+    mesh = read_mesh(options.mesh)
+    export = read_export_summary(options.mesh, say)
     up = export.get("up") if options.up is None else options.up
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
     read_s = clock.perf_counter() - begin
     run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, behind_m2k_w=behind, say=say)
     return replace(run, seconds={"read": read_s, **run.seconds})
-
-
-def _given(options: Heat) -> tuple[Path, str]:
-    """Return mesh and scene; raises `HeatError` if one is missing."""
-    if options.mesh is None or options.scene is None:
-        missing = "mesh" if options.mesh is None else "scene"
-        remedy = "Pass the mesh.vtu of an export, and --scene winter-night; --write-scene writes one to change."
-        raise HeatError(missing, expected="a file", got="none", remedy=remedy)
-    return options.mesh, options.scene
 
 
 def resistances_of_audit(path: Path, say: Say = lambda _: None) -> dict[str, float]:
@@ -202,9 +201,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         "no_wall": run.no_wall,
         "unfit": list(run.unfit),
         "layers": [asdict(one) for one in run.layers],
-        "probes": [
-            {"point_m": point, "temperature_c": values} for point, values in zip(run.probes.points_m, run.probes_c.T)
-        ],
+        "probes": [{"point_m": point, "temperature_c": values} for point, values in zip(run.probes_m, run.probes_c.T)],
         "built": [heat.effect for heat in solution.effects],
         "left_out": [asdict(entry) for entry in run.left_out],
         "newton_iterations": int(np.sum(solution.newton_iterations)),
@@ -218,8 +215,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
 def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
     """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
-    from thermoxels_ns.heat.vtk_series import remove_heat_series, shown_states, write_heat_series
-    from thermoxels_ns.mesh.files.vtu import write_vtu
+    from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
     from thermoxels_ns.reports.page import identify, write_page
@@ -232,7 +228,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
         remove_heat_series(folder / THROUGH_TIME)
-        write_vtu(folder / STEADY, replace(shown.mesh, temperature_c=shown.states_c[-1]))
+        write_vtk(folder / STEADY, body_grid(replace(shown.mesh, temperature_c=shown.states_c[-1])))
     else:
         states = shown_states(run.solution.times_s, options.vtk_times)
         write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)
@@ -241,7 +237,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     drawn = {name: (folder / name).read_bytes() for name in pictures}
     shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]
-    mesh, scene = _given(options)
+    mesh, scene = options.mesh, options.scene
+    assert mesh is not None and scene is not None
     inputs = [mesh, mesh.with_name(f"{mesh.stem}-boundary.vtp"), Path(scene), *filter(None, [options.from_audit])]
     report = identify(inputs, scene, options.probes, options.up, options.tolerance, options.flow_tolerance)
     write_page(folder / PAGE, heat_page(run, drawn, mesh.name, command_of("heat", options), files, report))
@@ -256,3 +253,44 @@ def _write_series(path: Path, run: HeatRun) -> None:
         writer = csv.writer(file)
         writer.writerow(lines[0])
         writer.writerows(["" if value is None else repr(value) for value in line.values()] for line in lines)
+
+
+def shown_states(times_s: FloatArray, wanted_s: Literal["all"] | tuple[float, ...]) -> list[int]:
+    """Return which kept times go into a series: the first, the last, and the nearest to each of `wanted_s`; or all.
+
+    >>> shown_states(np.array([0.0, 60.0, 120.0, 180.0]), (70.0,))
+    [0, 1, 3]
+    """
+    near = times_s if wanted_s == "all" else (times_s[0], *wanted_s, times_s[-1])
+    return np.unique([np.abs(times_s - time_s).argmin() for time_s in near]).tolist()
+
+
+def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: list[int]) -> None:
+    """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
+
+    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are numbers of
+    kept times. An earlier series is removed first. Raises `OutputError` if writing fails.
+    """
+    from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
+
+    remove_heat_series(pvd)
+    folder = writable_folder(pvd.with_suffix(""))
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ElementTree.SubElement(root, "Collection")
+    for number, state in enumerate(states):
+        path, time_s = folder / f"step-{number:04d}.vtu", float(solution.times_s[state])
+        write_vtk(path, body_grid(replace(mesh, temperature_c=solution.temperature_c[state])))
+        name = path.relative_to(pvd.parent).as_posix()
+        ElementTree.SubElement(collection, "DataSet", timestep=repr(time_s), part="0", file=name)
+    ElementTree.indent(root)
+    with replace_when_done(pvd) as temporary:
+        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+
+
+def remove_heat_series(pvd: Path) -> None:
+    """Remove a series that `write_heat_series` wrote, if there is one; raise `OutputError` if a file stays."""
+    folder = pvd.with_suffix("")
+    for path in (pvd, *folder.glob(STEP_PATTERN)):
+        remove_file(path)
+    with suppress(OSError):  # it holds files of others, or there is none
+        folder.rmdir()

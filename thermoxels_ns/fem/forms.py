@@ -15,6 +15,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import Effect, HeatProblem, effect_labels, in_time, values_at
+from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -103,10 +104,6 @@ class _Exchange(_Boundary):
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the temperature of the surroundings per triangle, relative to the reference, shape (k, 1), [K]."""
         return self.at(1, time_s) - self._reference_c
-
-    def exchanging_nodes(self, time_s: float) -> IntArray:
-        """Return the numbers, ascending, of the nodes of those triangles whose `strength` is above 0."""
-        return np.unique(self.nodes[self.strength(time_s)[:, 0] > 0.0])
 
 
 class ConvectionForm(_Exchange):
@@ -202,7 +199,8 @@ class FixedForm:
         self.owners: IntArray = space.facet_nodes(parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
-        self._places, self._temperature = space.node_places(self.nodes), effect.quantities[0]
+        points_m, self._temperature = space.points_m[self.nodes], effect.quantities[0]
+        self._places = Places(points_m, np.zeros_like(points_m), space.selection.up)
         self.area_m2: Vector = space.selection.facet_area_m2[parts]
         """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
 

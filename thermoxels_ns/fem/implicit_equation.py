@@ -26,7 +26,6 @@ _BALANCED, _BALANCED_OVER_TOLERANCE = 1e-9, 1e3
 """Newton's method ends at an unbalanced share of the first, or of the second times the linear tolerance if larger."""
 MAX_ITERATIONS, MOST_CORRECTIONS = 60, 6
 """Most steps of Newton's method before the solver gives up: the first with radiation, the second without."""
-_ESTIMATE_TOLERANCE = 1e-3  # Relative tolerance of the linear solver for error estimates
 _NEWTON_TOLERANCE = 1e-6
 """Relative tolerance of the linear solver in a Newton step with radiation: the next step corrects the error left."""
 _SAFE = 0.1
@@ -230,7 +229,7 @@ class ImplicitEquation:
         tolerance = _NEWTON_TOLERANCE if nonlinear else self._relative_tolerance
         while count < most and np.isfinite(rest.unbalanced_w):
             now_k = start_k + change_k
-            direction, linear = self._correction(rest.heat_w, rest.whole_w, now_k, time_s, tolerance)
+            direction, linear = self.correction(rest.heat_w, rest.whole_w, now_k, time_s, tolerance)
             spent, count, status = spent + linear.iterations, count + 1, linear.status
             length = self._length(now_k, direction, rest.heat_w, time_s) if nonlinear else 1.0
             settled = not nonlinear or self._is_short(now_k, direction, _SETTLED)
@@ -260,17 +259,13 @@ class ImplicitEquation:
             now_k, change_k, uncertain_w, flows_w, spent, newton, converged=settled and balances, status=status
         )
 
-    def damped(self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float) -> Vector:
-        """Return an estimate e, (n,), [K]: (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w`.
+    def correction(
+        self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float, tolerance: float
+    ) -> tuple[Vector, LinearSolution]:
+        """Solve (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w` for the change e, (n,), [K].
 
         `whole_w`, [W], is the sum of `heat_w` without conduction and its round-off.
         """
-        return self._correction(heat_w, whole_w, relative_k, time_s, _ESTIMATE_TOLERANCE)[0]
-
-    def _correction(
-        self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float, tolerance: float
-    ) -> tuple[Vector, LinearSolution]:
-        """Solve for the change, (n,), [K], that takes up heat (as in `Residual`), radiation linear at `relative_k`."""
         row_sums_w_k = self._row_sums_w_k
         if self._system.nonlinear:
             slope = self._system.radiation_slope(relative_k, time_s)
@@ -281,7 +276,8 @@ class ImplicitEquation:
                 self._solvers[tolerance] = LinearSolver(self._matrix, relative_tolerance=tolerance)
             solver = self._solvers[tolerance]
         linear = solver.solve(self._at_free(heat_w))
-        change_k = self._everywhere(linear.x)
+        change_k = np.zeros(self._system.num_nodes)  # fixed nodes do not change
+        change_k[self._system.fixed.free] = linear.x
         if not len(self._system.fixed.nodes):
             change_k += (whole_w - np.sum(row_sums_w_k * change_k)) / np.sum(row_sums_w_k)
         return change_k, linear
@@ -293,12 +289,6 @@ class ImplicitEquation:
     def _free_block(self, matrix: sparse.csr_matrix) -> sparse.csr_matrix:
         fixed = self._system.fixed
         return sparse.csr_matrix(matrix[fixed.free][:, fixed.free]) if len(fixed.nodes) else matrix
-
-    def _everywhere(self, free: Vector) -> Vector:
-        """Return values at all nodes, shape (n,), from values at the free nodes; fixed nodes get 0."""
-        full = np.zeros(self._system.num_nodes)
-        full[self._system.fixed.free] = free
-        return full
 
     def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
         """Return the heat that is unbalanced at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""

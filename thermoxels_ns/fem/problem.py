@@ -53,11 +53,6 @@ class TimeSteps:
         """Time 0, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
-    @property
-    def lengths_s(self) -> FloatArray:
-        """Lengths of the steps, shape (steps,), [s]."""
-        return np.full(self.steps, self.step_seconds)
-
 
 @record(HeatError)
 class AdaptiveSteps:

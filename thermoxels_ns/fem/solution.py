@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.linear_tets import refine_mesh
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = FloatArray

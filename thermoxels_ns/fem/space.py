@@ -125,8 +125,11 @@ class Space:
         return shapes, 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
-        """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3]."""
-        (points, weights), mesh = self._source_rule, self.selection.mesh
+        """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3].
+
+        Integrals with them are exact for polynomials of degree `order`.
+        """
+        (points, weights), mesh = get_quadrature(RefTet, self.order), self.selection.mesh
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
         corners = mesh.points_m[mesh.tets[tets]]
         places = np.einsum("aq,tai->tqi", barycentric, corners).reshape(-1, 3)
@@ -135,21 +138,11 @@ class Space:
 
     def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
         """Spread the heat at the points of `source_points`, shape (k q,), [W], over the nodes, shape (n,), [W]."""
-        points, weights = self._source_rule
+        points, weights = get_quadrature(RefTet, self.order)
         nodes = self.tet_nodes()[tets].T
         shapes = np.stack([self.element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(len(nodes))])
         shares = np.einsum("tq,aq->at", point_w.reshape(-1, len(weights)), shapes)
         return sums_by_number(nodes.ravel(), shares.ravel(), self.num_nodes)
-
-    @property
-    def _source_rule(self) -> tuple[Vector, Vector]:
-        """Points and weights in the reference tetrahedron that are exact for polynomials of degree `order`."""
-        return get_quadrature(RefTet, self.order)
-
-    def node_places(self, nodes: Numbers) -> Places:
-        """Return the positions of nodes, without normals."""
-        points_m = self.points_m[nodes]
-        return Places(points_m, np.zeros_like(points_m), self.selection.up)
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:

@@ -89,8 +89,8 @@ def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
 def _check_held(system: HeatSystem) -> None:
     """Raise `HeatError` if a connected piece has nothing that sets its temperature in a steady state."""
     count, piece = connected_components(system.stiffness, directed=False)
-    held = np.concatenate([system.fixed.nodes, *(form.exchanging_nodes(0.0) for form in system.surface_forms)])
-    loose = np.setdiff1d(np.arange(count), piece[held])
+    acting = (form.nodes[form.strength(0.0)[:, 0] > 0.0].ravel() for form in system.surface_forms)
+    loose = np.setdiff1d(np.arange(count), piece[np.concatenate([system.fixed.nodes, *acting])])
     if len(loose):
         sizes = np.bincount(piece)
         largest = loose[np.argmax(sizes[loose])]

@@ -106,9 +106,8 @@ class HeatSystem:
     def _sum_of_convection(self, time_s: float) -> sparse.csr_matrix | None:
         if not self._convection:
             return None
-        total = sparse.csr_matrix(self.stiffness.shape)
-        for form in self._convection:
-            total = sparse.csr_matrix(total + form.convection_matrix(time_s))
+        matrices = (form.convection_matrix(time_s) for form in self._convection)
+        total = sum(matrices, sparse.csr_matrix(self.stiffness.shape))
         most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), _LEAST)))
         if not most <= MOST_TIMES_CONDUCTION:
             remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
@@ -132,26 +131,18 @@ class HeatSystem:
         self, forms: Sequence[ConvectionForm | FluxForm | SourceForm], kept: dict[float, Vector], time_s: float
     ) -> Vector:
         def add_up(at_s: float) -> Vector:
-            total = np.zeros(self.num_nodes)
-            for form in forms:
-                total += form.load(at_s)
-            return total
+            return sum((form.load(at_s) for form in forms), np.zeros(self.num_nodes))
 
         return at_time(kept, time_s if any(form.load_in_time for form in forms) else 0.0, add_up)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the net heat that radiation brings to each node, shape (n,), [W]."""
-        total = np.zeros(self.num_nodes)
-        for form in self._radiation:
-            total += form.load(relative_k, time_s)
-        return total
+        return sum((form.load(relative_k, time_s) for form in self._radiation), np.zeros(self.num_nodes))
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Return minus the derivative of `radiation_load` by the temperatures, shape (n, n), [W / K]."""
-        total = sparse.csr_matrix((self.num_nodes, self.num_nodes))
-        for form in self._radiation:
-            total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
-        return total
+        slopes = (form.slope(relative_k, time_s) for form in self._radiation)
+        return sum(slopes, sparse.csr_matrix(self.stiffness.shape))
 
     def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:
         """Return `load`, then the heat of convection and of radiation into each node if there is any, (n,), [W]."""

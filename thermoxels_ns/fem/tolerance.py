@@ -12,8 +12,8 @@ from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import record
+from thermoxels_ns.fem.linear_tets import refine_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Positive, TimeSteps
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, Solution, SteadySolution, mean_flows_w, share_of_heat
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import Progress, solve_heat

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 from scipy.spatial import KDTree
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.tables import HasTables, lines_of
@@ -45,26 +46,16 @@ _OUTSIDE = 1e-9
 """Distance outside a tetrahedron, as a share of its height, up to which a point counts as on its face."""
 
 
-@dataclass(frozen=True)
-class Probes:
-    """The p points in a body where temperatures are followed, with the weights of the nodes around each point."""
+def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> sparse.csr_matrix:
+    """Return the matrix, (p, n), that interpolates nodal values at points, shape (p, 3), [m].
 
-    points_m: FloatArray  # Positions, shape (p, 3), [m]
-    nodes: IntArray  # Nodes of the tetrahedron around each point, shape (p, 4)
-    weights: FloatArray  # Barycentric coordinates of each point in its tetrahedron, shape (p, 4), sum 1
-
-    def at(self, nodal: FloatArray) -> FloatArray:
-        """Return values at the points, shape (..., p), interpolated from values at the nodes, shape (..., n)."""
-        return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
-
-
-def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
-    """Return probes at points, shape (p, 3), [m]; raises `HeatError` if a point lies outside the body.
+    Each row has the barycentric coordinates of a point in its tetrahedron, which are at least 0 and have the sum 1.
+    Raises `HeatError` if a point lies outside the body.
 
     >>> corner, none = np.vstack([np.zeros(3), np.eye(3)]), np.zeros((0, 3), np.int64)
     >>> tets, seen = np.array([[0, 1, 2, 3]]), np.ones(4, bool)
     >>> mesh = TetMesh(corner, tets, np.array([0.0, 8.0, 0.0, 0.0]), seen, none, none[:, 0], np.array([0]))
-    >>> place_probes(mesh, [[0.25, 0.25, 0.25]]).at(mesh.temperature_c).tolist()
+    >>> (place_probes(mesh, [[0.25, 0.25, 0.25]]) @ mesh.temperature_c).tolist()
     [2.0]
     """
     remedy = "Give three coordinates in metres for each probe."
@@ -75,7 +66,9 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     nodes, weights = np.zeros((len(points), 4), np.int64), np.zeros((len(points), 4))
     for number, point in enumerate(points):
         near = np.flatnonzero(np.all((low <= point + slack) & (high >= point - slack), axis=1))
-        shares = _barycentric(corner[near], point)
+        sides, reach = corner[near, 1:] - corner[near, :1], point - corner[near, 0]
+        others = np.linalg.solve(np.swapaxes(sides, 1, 2), reach[..., None])[..., 0]
+        shares = np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)  # barycentric coordinates
         # A point on a face or node lies in several tetrahedra: take the one it lies deepest in, the first of equals.
         best = int(np.argmax(shares.min(axis=1))) if len(near) else -1
         if best < 0 or shares[best].min() < -_OUTSIDE:
@@ -86,14 +79,8 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
             raise HeatError(f"probe {number + 1}", expected="a point inside the body", got=got, remedy=remedy)
         inside = np.clip(shares[best], 0.0, 1.0)
         nodes[number], weights[number] = mesh.tets[near[best]], inside / inside.sum()
-    return Probes(points, nodes, weights)
-
-
-def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
-    """Return the barycentric coordinates of a point in k tetrahedra with corners (k, 4, 3), shape (k, 4)."""
-    sides = corner[:, 1:] - corner[:, :1]
-    others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
-    return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
+    ends = np.arange(0, 4 * len(points) + 1, 4)
+    return sparse.csr_matrix((weights.ravel(), nodes.ravel(), ends), shape=(len(points), len(mesh.points_m)))
 
 
 @dataclass(frozen=True)
@@ -117,8 +104,8 @@ class HeatRun(HasTables):
     """U-value and f_Rsi of the body between two airs in a steady state; None without airs, or if `no_wall` says why."""
     no_wall: str  # Sentence on why a steady state between two unlike airs gave no `wall`; else empty
     mean_c: FloatArray  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
-    probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
-    probes_c: FloatArray  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
+    probes_m: FloatArray  # Points where temperatures are followed, shape (p, 3), [m]
+    probes_c: FloatArray  # Temperatures at `probes_m`, shape (s, p), [degrees Celsius]
     seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
 
     def __repr__(self) -> str:
@@ -171,7 +158,8 @@ def run_scene(
     start, scene = clock.perf_counter(), scene.on(mesh)
     scene, layers = (scene, ()) if behind_m2k_w is None else with_layers(scene, mesh, behind_m2k_w, up)
     problem = scene.problem(mesh, up=up)
-    probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
+    points_m = np.array(probes_m, dtype=np.float64).reshape(-1, 3)
+    place_probes(mesh, points_m)  # raises before anything slow
     about_patches = patch_warnings(scene, mesh, problem.up)
     inner, harmless = ((), ()) if about_patches else inner_surface_warnings(scene, mesh, problem.up)
     about_scene = air_warnings(scene)
@@ -197,7 +185,7 @@ def run_scene(
 
     nodes = solution_nodes(solved, solution)
     wall = wall_of_scene(scene, solved, solution, nodes, doubtful=bool(about_patches))
-    probes = place_probes(nodes.mesh, probes.points_m)
+    probes = place_probes(nodes.mesh, points_m)
     results = heat_results(solved, solution, nodes)
     return HeatRun(
         scene=scene,
@@ -214,8 +202,8 @@ def run_scene(
         wall=None if isinstance(wall, str) else wall,
         no_wall=wall if isinstance(wall, str) else "",
         mean_c=nodes.states_c @ volume_shares(nodes.mesh),
-        probes=probes,
-        probes_c=probes.at(nodes.states_c),
+        probes_m=points_m,
+        probes_c=np.stack([probes @ state_c for state_c in nodes.states_c]),
         seconds={**seconds, "answers": clock.perf_counter() - done},
     )
 
@@ -257,15 +245,19 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
             "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
             'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.',
         )
-    if inside_air is not None and not _has_rooms(selection, matching_facets(selection, inside_air.patches)):
-        area = float(selection.facet_area_m2[matching_facets(selection, inside_air.patches)].sum())
-        return (
-            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
-            "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
-            "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
-            "name the inner surface with --patches.",
-        )
-    return ()
+    if inside_air is None:
+        return ()
+    inside = matching_facets(selection, inside_air.patches)
+    area, whole = selection.facet_area_m2[inside], float(selection.facet_area_m2[inside].sum())
+    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    if float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * whole:  # walls and floors of rooms
+        return ()
+    return (
+        f"The scene names air inside, but the body has no rooms: of the {whole:.4g} m² that no photograph saw, next "
+        "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
+        "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
+        "name the inner surface with --patches.",
+    )
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -423,13 +415,6 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
         "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
         "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
     )
-
-
-def _has_rooms(selection: Selection, inside: BoolArray) -> bool:
-    """Return whether enough of the triangles marked in `inside` face up or sideways to be walls and floor of rooms."""
-    area = selection.facet_area_m2[inside]
-    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
-    return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
 
 
 def _outwards(selection: Selection, chosen: BoolArray) -> float:

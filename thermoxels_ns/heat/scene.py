@@ -94,7 +94,7 @@ class HeatScene:
     description: str = ""  # Description of the scene, for reports
 
     def __post_init__(self) -> None:
-        if self.sky is not None and self.sky.needs_air and self.outside_air is None:
+        if self.sky is not None and self.sky.temperature_c is None and self.outside_air is None:
             remedy = "Add outside_air, or give the sky's temperature_c."
             raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
         for key, air in (("inside_air", self.inside_air), ("outside_air", self.outside_air)):
@@ -119,11 +119,6 @@ class HeatScene:
     def steady(self) -> bool:
         """True if the steady state is asked for, `time` being None."""
         return self.time is None
-
-    @property
-    def uses_photographs(self) -> bool:
-        """True if the result depends on a temperature that photographs measured."""
-        return self.time is not None and self.initial_c is None
 
     def on(self, mesh: TetMesh) -> HeatScene:
         """Return the scene whose default patches include the mesh's named ones: what photographs show is outside.

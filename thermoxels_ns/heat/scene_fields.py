@@ -219,11 +219,6 @@ class Sky:
     def __post_init__(self) -> None:
         check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
 
-    @property
-    def needs_air(self) -> bool:
-        """True if the temperature of the sky is computed from that of the outside air."""
-        return self.temperature_c is None
-
 
 @record(HeatError)
 class Ground:

@@ -129,7 +129,7 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
     Raises `HeatError` if `up` and `north` are parallel.
     """
-    upward, northward = _unit(up), _unit(north)
+    upward, northward = (np.array(one) / np.linalg.norm(one) for one in (up, north))
     level = northward - (northward @ upward) * upward
     if float(np.linalg.norm(level)) < 1e-6:
         remedy = "Give north along the ground."
@@ -178,8 +178,3 @@ def facet_irradiance(
     diffuse = sunlight.diffuse_w_m2 * sky_view(normals, up)
     on_ground = sunlight.direct_w_m2 * height + sunlight.diffuse_w_m2
     return direct + diffuse + ground_reflectance * on_ground * ground_view(normals, up)
-
-
-def _unit(direction: Vector) -> FloatArray:
-    vector = np.asarray(direction, dtype=np.float64)
-    return vector / np.linalg.norm(vector)

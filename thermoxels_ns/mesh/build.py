@@ -11,8 +11,8 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions, with_patches
-from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
+from thermoxels_ns.mesh.solid.free_space import seen_facets
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
@@ -133,7 +133,8 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    tagged, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
+    seen, outside = _seen_and_outside(mesh, points, solid, snapshot, transform[:3, :3] / scale)
+    tagged, idle_patches = with_patches(replace(mesh, boundary=replace(mesh.boundary, seen=seen)), rules, up, outside)
     return BuiltMesh(tagged, solid, parts, num_voxels, (*idle_patches, *idle_regions))
 
 
@@ -156,16 +157,13 @@ def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> B
     return cut
 
 
-def _tagged(
-    mesh: TetMesh,
-    points_index: FloatArray,
-    solid: SolidCells,
-    snapshot: GridSnapshot,
-    rotation: FloatArray,
-    up: tuple[float, float, float],
-    rules: PatchRules,
-) -> tuple[TetMesh, tuple[str, ...]]:
-    """Return the mesh with tags of all boundary triangles, and the idle rules; without cameras all count as seen."""
+def _seen_and_outside(
+    mesh: TetMesh, points_index: FloatArray, solid: SolidCells, snapshot: GridSnapshot, rotation: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return which boundary triangles cameras see, all without cameras, and which count as exterior, shape (f,) each.
+
+    `points_index` are the nodes in corner indices, (n, 3); `rotation`, (3, 3), turns the trained scene to the mesh.
+    """
     normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:
@@ -178,8 +176,7 @@ def _tagged(
         inner = ~seen & grow(solid.rooms, 1)[tuple(beside.T)]
         # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
         outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
-    tagged = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
-    return with_patches(tagged, rules, up, outside)
+    return seen, outside
 
 
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:

@@ -20,8 +20,7 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import printable
 from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
-from thermoxels_ns.reports.charts import PERCENTILES, colours
-from thermoxels_ns.reports.page import build_page, image_file, write_page
+from thermoxels_ns.reports.page import PERCENTILES, build_page, colours, image_file, write_page
 
 _DEPTH_STEP = 4  # Spacing of the pixels at which depth is looked up, [pixels]; depth is interpolated in between
 _COLOUR_SHARE = 0.55  # Opacity of the thermal colours over the photograph

@@ -1,25 +1,30 @@
-"""Build the page of a heat run."""
+"""Build the page of a heat run, with its charts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from io import StringIO
+from typing import Any
 
 import numpy as np
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.fem.problem import Varying, effect_labels
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.heat.scene import unit_of
-from thermoxels_ns.reports.charts import plot_over_time
-from thermoxels_ns.reports.numbers import point_text, unit_signs
+from thermoxels_ns.reports.numbers import point_text, time_unit, unit_signs
 from thermoxels_ns.reports.page import Report, build_page
 
 _CAPTIONS = {
     "surface-end.png": "The surface at the end. Colours span the surface that photographs show.",
     "cut.png": "Cut through the middle at the end. Colours span the whole body.",
 }
+INK, SOFT, LINE = "#1d2430", "#9aa3ae", "#e1e5ea"
+"""Colours of the pages' style sheet, ``templates/page.css``."""
+_MOST_CURVES = 8  # Most probes or effects in one plot; more curves look alike
 
 
 def heat_page(
@@ -27,7 +32,7 @@ def heat_page(
 ) -> str:
     """Return a heat run's page as html; `pictures` are PNG contents by file name, `files` names of files beside it."""
     solution = run.solution
-    names = [f"{point_text(point)} m" for point in run.probes.points_m]
+    names = [f"{point_text(point)} m" for point in run.probes_m]
     over_time = isinstance(solution, HeatSolution)
     return build_page(
         "heat.html.j2",
@@ -60,3 +65,43 @@ def _values(effect: Effect) -> str:
         unit = {"1": "", "C": " °C"}.get(unit, f" {unit_signs(unit)}")
         shown.append(f"{name} varies" if isinstance(value, Varying) else f"{name} {value:g}{unit}")
     return "; ".join(shown)
+
+
+def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
+    """Return charts of temperatures and, below, of each effect's heat flow over time, as an svg element.
+
+    `mean_c` is the mean of the volume, shape (s + 1,); `probes_c` has shape (s + 1, p); both are in [degrees Celsius].
+    Heat flows are means over the intervals between the s + 1 times.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    look: Any = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
+    look |= {"axes.spines.top": False, "axes.spines.right": False}
+    unit, length_s = time_unit(float(solution.times_s[-1]))
+    times, states = solution.times_s / length_s, solution.temperature_c
+    strongest = sorted(solution.effects, key=lambda heat: -np.abs(heat.heat_w).max(initial=0.0))
+    acting = [heat for heat in strongest if np.any(heat.heat_w)][:_MOST_CURVES]
+    with rc_context(look):
+        figure = Figure(figsize=(10.5, 7.0), layout="constrained")
+        FigureCanvasSVG(figure)
+        above, below = figure.subplots(2, 1, sharex=True)
+        above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
+        above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
+        for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
+            above.plot(times, values, label=name.replace("$", r"\$"))  # matplotlib would read $ as a formula
+        below.axhline(0.0, color=SOFT, linewidth=0.8)
+        for heat in acting:
+            below.stairs(heat.heat_w, times, baseline=None, label=heat.effect.replace("$", r"\$"), linewidth=1.4)
+        below.stairs(solution.heat_w, times, baseline=None, label="all together: stored", color=INK, linewidth=2)
+        below.set_xlabel(f"time [{unit}]")
+        below.set_xlim(times[0], times[-1])
+        for axis, label in ((above, "temperature [°C]"), (below, "heat flow into the body [W]")):
+            axis.set_ylabel(label)
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
+            axis.grid(color=LINE, linewidth=0.6)
+            axis.set_axisbelow(True)
+        text = StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()[text.getvalue().index("<svg") :].rstrip()

@@ -221,18 +221,6 @@ def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_came
     plotter.reset_camera_clipping_range()
 
 
-def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], length_unit: str) -> None:
-    """Draw two pictures of a mesh: with all temperatures, and with grey where no thermal ray measured a temperature.
-
-    `paths` are the two files; `look` are the arguments `up` and `view_direction` of `image_of_surface`.
-    """
-    painted = [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]
-    every = image_of_mesh(mesh, title="Surface temperature", length_unit=length_unit, **look)
-    write_picture(paths[0], every)
-    title = "Measured surface temperature"
-    write_picture(paths[1], image_of_mesh(mesh, title=title, painted=painted, length_unit=length_unit, **look))
-
-
 def draw_surface(
     folder: Path, mesh: TetMesh, states_c: FloatArray, times_s: FloatArray, up: tuple[float, float, float]
 ) -> None:

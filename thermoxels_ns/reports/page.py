@@ -1,6 +1,6 @@
-"""Build html pages from templates and print them as PDF; a page is one file that loads nothing else.
+"""Build html pages from templates, print them as PDF, and show temperatures in colours.
 
-Only the pages of audits and batches run a script.
+A page is one file that loads nothing else. Only the pages of audits and batches run a script.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.reports import numbers
 
+PERCENTILES = (2.0, 98.0)  # Percentiles of a thermal image's temperatures at its darkest and brightest colour
 Picture: TypeAlias = tuple[bytes, str]
 """Content of a PNG or JPEG file, and its caption."""
 
@@ -107,6 +108,28 @@ def write_pdf(path: Path, page: str) -> None:
 
     with replace_when_done(path) as temporary:
         HTML(string=page).write_pdf(temporary)
+
+
+def gradient() -> str:
+    """Return the colours of `colours`, from dark to bright, as a list for a style sheet."""
+    shown = colours(np.linspace(0.0, 1.0, 17)[None], (0.0, 1.0))[0]
+    return ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in shown.tolist())
+
+
+def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
+    """Return colours, (h, w, 3), of temperatures, (h, w), from `limits` (default: `PERCENTILES`); black where NaN."""
+    import cv2
+
+    known = np.isfinite(temperature_c)
+    if limits is None:
+        low, high = np.percentile(temperature_c[known], PERCENTILES) if known.any() else (0.0, 1.0)
+    else:
+        low, high = limits
+    share = np.nan_to_num((temperature_c - low) / max(float(high - low), 1e-6))
+    levels = np.clip(255 * share, 0, 255).astype(np.uint8)
+    shown = np.array(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1], dtype=np.uint8)
+    shown[~known] = 0
+    return shown
 
 
 @cache

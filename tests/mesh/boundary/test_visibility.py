@@ -6,8 +6,8 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.boundary.visibility import facet_views, seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets
+from thermoxels_ns.mesh.solid.free_space import facet_views, seen_facets
 from thermoxels_ns.mesh.tetrahedra import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 

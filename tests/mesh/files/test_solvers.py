@@ -10,8 +10,8 @@ import pytest
 import pyvista as pv
 
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.files import solvers
-from thermoxels_ns.mesh.files.solvers import (
+from thermoxels_ns.mesh.files import formats
+from thermoxels_ns.mesh.files.formats import (
     BODY_GRID,
     FACET_GRID,
     TEMPERATURE_VIEW,
@@ -167,8 +167,8 @@ def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagge
             raise OutputError("no space")
         return replace_when_done(final)
 
-    replace_when_done = solvers.replace_when_done
-    monkeypatch.setattr(solvers, "replace_when_done", full_disk)
+    replace_when_done = formats.replace_when_done
+    monkeypatch.setattr(formats, "replace_when_done", full_disk)
     with pytest.raises(OutputError, match="no space"):
         write_xdmf(path, tagged_mesh)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]

@@ -9,7 +9,7 @@ import pyvista as pv
 from tests.support.unreadable import forbid
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp
+from thermoxels_ns.mesh.files.vtu import boundary_surface, read_mesh, write_vtk
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, facet_areas, facet_normals
 
 
@@ -19,7 +19,7 @@ def names_in(data: pv.DataSet) -> list[str]:
 
 
 def test_tags_come_back_under_their_names(tmp_path, tagged_mesh):
-    write_boundary_vtp(tmp_path / "house-boundary.vtp", tagged_mesh)
+    write_vtk(tmp_path / "house-boundary.vtp", boundary_surface(tagged_mesh))
     read = pv.read(tmp_path / "house-boundary.vtp")
     tags, node = tagged_mesh.boundary, read.point_data["node"]
     assert np.array_equal(node[read.regular_faces], tagged_mesh.facets)

@@ -115,7 +115,7 @@ def test_regular_tetrahedron():
     shapes = shapes_of(REGULAR)
     cosines = shapes.dihedral_cosines()
     assert cosines[:, 0] == pytest.approx([1 / 3] * 6)
-    assert shapes.volumes.tolist() == pytest.approx([8 / 3])
+    assert shapes.six_volumes.tolist() == pytest.approx([16.0])
     # Edge length l: each edge adds -cot(angle) l / 6 = -l / (6 sqrt 8).
     assert shapes.stiffness()[:, 0] == pytest.approx([-np.sqrt(8) / (6 * np.sqrt(8))] * 6)
 

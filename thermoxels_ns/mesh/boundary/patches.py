@@ -18,7 +18,7 @@ import yaml
 from pydantic import Field
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_array, check_direction, replace_when_done
+from thermoxels_ns.core.checks import check_direction, replace_when_done
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
@@ -252,9 +252,7 @@ def _applied(
     colours: npt.NDArray | None,
 ) -> Applied:
     """Return `start` overwritten where rules hold; `allowed` has one mask per rule for conditions not checked here."""
-    count, remedy = len(start), f"Pass one centroid per element that gets a {kind}."
-    check_array("centroids", centroids, (count, 3), remedy, MeshError)
-    owner = np.full(count, -1, dtype=np.int64)
+    owner = np.full(len(start), -1, dtype=np.int64)
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()
         if rule.box is not None:

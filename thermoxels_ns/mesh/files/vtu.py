@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_array, plain_os_errors, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_array, plain_os_errors, replace_when_done
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, PatchRules, with_patches
@@ -46,28 +46,14 @@ _DISK_IS_FULL = 20007  # VTK's error code
 _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
-def write_vtu(path: Path | str, mesh: TetMesh) -> None:
-    """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
+def write_vtk(path: Path, data: pv.PolyData | pv.UnstructuredGrid) -> None:
+    """Write polygons (.vtp) or a grid (.vtu) as ParaView and pyvista read it; raise `OutputError` on failure."""
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
-    Point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0: extended)
-    where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
-    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite.
-        OutputError: The file cannot be written.
-    """
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    grid = body_grid(mesh)
-    for array in map(grid.GetFieldData().GetAbstractArray, range(len(mesh.region_names))):
+    writer: Any = vtkXMLPolyDataWriter() if path.suffix == ".vtp" else vtkXMLUnstructuredGridWriter()
+    fields = data.GetFieldData()
+    for array in map(fields.GetAbstractArray, range(fields.GetNumberOfArrays())):
         array.SetName(escape(array.GetName()))  # VTK writes names of arrays into its XML as they are
-    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), grid)
-
-
-def write_vtk(writer: Any, path: Path, data: Any) -> None:
-    """Write `data` by VTK's XML `writer` for such data sets, making the folder; raise `OutputError` on failure."""
-    writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
         writer.SetInputData(data)
@@ -104,20 +90,6 @@ def boundary_path(path: Path | str) -> Path:
     """
     path = Path(path)
     return path.with_name(f"{path.stem}-boundary.vtp")
-
-
-def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
-    """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
-
-    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch in
-    the field array `patch_names`, from 1 as in every format), `on_box` (1: the scene box or the region cuts the solid
-    there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
-    `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
-    mesh has colours, `colour` as bytes.
-    """
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    write_vtk(vtkXMLPolyDataWriter(), Path(path), boundary_surface(mesh))
 
 
 def read_mesh(path: Path | str) -> TetMesh:
@@ -284,7 +256,12 @@ def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
 
 
 def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
-    """Return the tetrahedra with the arrays that `vtu.write_vtu` names."""
+    """Return the tetrahedra, as .vtu files hold them; raises `MeshError` if an array does not fit or is not finite.
+
+    Point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0: extended)
+    where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
+    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
+    """
     import pyvista as pv
 
     mesh.check()
@@ -301,7 +278,14 @@ def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
 
 
 def boundary_surface(mesh: TetMesh) -> pv.PolyData:
-    """Return the boundary triangles with the arrays that `vtu.write_boundary_vtp` names."""
+    """Return the boundary triangles with their tags, as .vtp files hold them; raises `MeshError` as `body_grid`.
+
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch in
+    the field array `patch_names`, from 1 as in every format), `on_box` (1: the scene box or the region cuts the solid
+    there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
+    `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
+    mesh has colours, `colour` as bytes.
+    """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
@@ -34,10 +33,6 @@ class Groups:
     def first(self) -> IntArray:
         """Return the smallest row number of each group, shape (groups,)."""
         return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
-
-    def sums(self, values: npt.NDArray) -> npt.NDArray:
-        """Return for each group the sum of `values` (rows,) over its rows, shape (groups,)."""
-        return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
 
     def pairs(self) -> tuple[IntArray, IntArray]:
         """Return all pairs of rows that follow each other in a group, as two arrays: first and second row of each."""
@@ -69,11 +64,6 @@ def group_sides(facets: IntArray) -> Groups:
     """Group the sides of triangles by their ends; row 3 f + s is the side of triangle f from its node s to the next."""
     ends = np.roll(facets, -1, axis=1)
     return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
-
-
-def triangles_across_edges(sides: Groups) -> IntArray:
-    """Return pairs of triangles that share an edge, shape (p, 2); `sides` is the result of `group_sides`."""
-    return np.stack(sides.pairs(), axis=1) // 3
 
 
 def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
@@ -145,7 +135,8 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
     turn = (np.argmin(both, axis=1)[:, None] + np.arange(3)) % 3  # the smallest node first, so orientation stays
     both = np.take_along_axis(both, turn, axis=1)
     same = group_pairs(both[:, 0], both[:, 1] * len(mesh.points_m) + both[:, 2])
-    return int(np.abs(same.sums(np.repeat([1, -1], [len(wanted), len(mesh.facets)]))).sum())
+    side = np.repeat([1, -1], [len(wanted), len(mesh.facets)])[same.order]
+    return int(np.abs(np.add.reduceat(side, same.start)).sum()) if len(same.start) else 0
 
 
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:

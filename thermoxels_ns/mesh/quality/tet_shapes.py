@@ -29,11 +29,6 @@ class TetShapes:
     six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
     reach: float  # largest coordinate of the mesh in magnitude, from which round-off is estimated, [m]
 
-    @property
-    def volumes(self) -> FloatArray:
-        """Return the signed volumes, negative for tetrahedra that are turned over, shape (t,), [m^3]."""
-        return self.six_volumes / 6.0
-
     def dihedral_cosines(self) -> FloatArray:
         """Return the cosines of the dihedral angles at `TET_EDGES`, (6, t); angles at a face without area are 0."""
         lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
@@ -92,7 +87,7 @@ def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
     """Return volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative for tetrahedra turned over."""
     volumes = np.empty(len(tets))
     for which, shapes in shapes_in_chunks(points, tets):
-        volumes[which] = shapes.volumes
+        volumes[which] = shapes.six_volumes / 6.0
     return volumes
 
 

@@ -25,8 +25,6 @@ from thermoxels_ns.mesh.solid.free_space import (
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 
-RegionKind = Literal["auto", "all"]
-InteriorKind = Literal["solid", "hollow"]
 _AsTuple = BeforeValidator(
     lambda given: tuple(np.asarray(given).tolist()) if isinstance(given, (list, np.ndarray)) else given
 )
@@ -62,10 +60,10 @@ class SolidSelection:
     """Least density, [1 / world unit]; overrides the percentile. Rays choose if both are None."""
     close_gaps: Annotated[int, Field(ge=0, le=100)] = 1
     """Gaps up to twice this many voxels wide are filled (a morphological closing)."""
-    region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
+    region: Literal["auto", "all"] = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
     region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
-    interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
+    interior: Literal["solid", "hollow"] = "solid"  # The voxels of `interior` are filled, or stay empty
     wall_thickness: Annotated[float, Field(gt=0)] | None = None
     """Thickness that walls get instead of a filled interior, [m]."""
 
