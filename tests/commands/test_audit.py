@@ -7,7 +7,6 @@ import re
 import sys
 import zlib
 from dataclasses import replace
-from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +26,6 @@ from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.reports.audit_page import draw_audit
 from thermoxels_ns.reports.audit_view import view_data
-
-GBXML = distribution("xgbxml").locate_file("xgbxml/schemas/GreenBuildingXML_Ver6.01.xsd")
-NAMESPACE = "{http://www.gbxml.org/schema}"
-POSITIVE = [f"{NAMESPACE}{tag}" for tag in ("Area", "Volume", "Height", "Width", "U-value")]
 
 
 @pytest.fixture(scope="module")

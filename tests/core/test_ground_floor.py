@@ -8,9 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermoxels_ns.core.checks import (
-    check_finite,
-    check_positive,
-    check_shape,
     remove_file,
     replace_when_done,
 )
@@ -24,17 +21,6 @@ from thermoxels_ns.core.units import TemperatureRange
 def test_impossible_ranges_are_refused(bounds):
     with pytest.raises(ThermoxelsError, match=r"^temperature range: "):
         TemperatureRange(*bounds)
-
-
-def test_checks_name_what_is_wrong():
-    for call in (
-        lambda: check_positive("it", -1.0, "Go forward.", MeshError),
-        lambda: check_finite("it", np.array([1.0, np.nan, np.inf]), "Mend it.", MeshError),
-        lambda: check_shape("it", np.zeros((4, 2)), (None, 3), "Transpose it.", MeshError),
-    ):
-        with pytest.raises(MeshError, match=r"^it: expected"):
-            call()
-    assert check_positive("x", 2, "") == 2.0
 
 
 def test_interrupted_write_leaves_the_old_file_and_no_rubbish(tmp_path):
@@ -118,11 +104,6 @@ def test_what_is_no_value_is_refused_with_what_helps(written, unit, message) -> 
 
 
 LATTICE = Lattice((-1.0, 0.25, 3.0), 0.5, (4, 3, 5))
-
-
-@given(st.lists(st.floats(-50, 50), min_size=3, max_size=3))
-def test_index_and_world_are_inverse(index):
-    np.testing.assert_allclose(LATTICE.world_to_index(LATTICE.index_to_world(index)), index, atol=1e-9)
 
 
 def test_corners_and_centres_sit_where_the_house_says():

@@ -137,10 +137,6 @@ def test_the_residual_is_round_off_where_flows_cancel() -> None:
     assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
 
 
-def laplacian(n: int) -> sparse.csr_matrix:
-    return sparse.diags([-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], [-1, 0, 1], format="csr")
-
-
 def weighted_graph(n: int = 400, seed: int = 0) -> sparse.csr_matrix:
     """Laplacian of a random graph with weights over six decades, plus a small mass: symmetric positive definite."""
     rng = np.random.default_rng(seed)

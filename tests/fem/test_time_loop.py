@@ -9,7 +9,6 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Quantity, TimeSteps, Varying, tabulated
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
-from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
@@ -104,15 +103,6 @@ FLASH = np.array([0.0, 0.0, 500.0, 0.0, 0.0])
 def warmed(flux: Quantity, time: TimeSteps | AdaptiveSteps):
     mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
     return solve_heat(HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), flux),)), time)
-
-
-def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
-    table, nowhere = (
-        tabulated(np.array([10.0, 20.0, 50.0]), np.array([1.0, 3.0, 0.0])),
-        Places(np.zeros((1, 3)), np.zeros((1, 3))),
-    )
-    assert [table.function(nowhere, time_s) for time_s in (0.0, 10.0, 15.0, 35.0, 99.0)] == [1.0, 1.0, 2.0, 1.5, 0.0]
-    assert table.resolution_s == 10.0 and table.in_time
 
 
 def test_adaptive_steps_do_not_step_over_a_table() -> None:

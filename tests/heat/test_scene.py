@@ -19,7 +19,6 @@ from thermoxels_ns.heat.scene_fields import (
     Sky,
     Sun,
     Surface,
-    radiative_coefficient,
 )
 from thermoxels_ns.heat.sky import swinbank_sky_c
 
@@ -259,12 +258,6 @@ PLACE = {"latitude_deg": 47.0, "longitude_deg": 8.0, "north": (0.0, 1.0, 0.0)}
 def test_sections_say_what_is_wrong(make, named: str) -> None:
     with pytest.raises(HeatError, match=f"^{named}"):
         make()
-
-
-@pytest.mark.parametrize(("mean_c", "published"), [(-10.0, 4.13), (10.0, 5.15), (30.0, 6.32)])
-def test_radiation_made_linear(mean_c: float, published: float) -> None:
-    assert round(radiative_coefficient(mean_c, 1.0), 2) == published
-    assert radiative_coefficient(mean_c, 0.5) == 0.5 * radiative_coefficient(mean_c, 1.0)
 
 
 def test_horizontal_reaches_to_30_degrees() -> None:
