@@ -10,7 +10,6 @@ import pytest
 
 from tests.support.demo_mesh import demo_mesh
 from tests.support.heat_bodies import CONCRETE
-from tests.support.house_mesh import house_mesh
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -18,9 +17,9 @@ _LONGEST_RUN_S = 300
 
 
 @pytest.fixture(scope="session", params=["house", "hot-object"])
-def solid_mesh(request: pytest.FixtureRequest) -> TetMesh:
+def solid_mesh(request: pytest.FixtureRequest, tagged_mesh: TetMesh) -> TetMesh:
     """The meshes that are handed to every program: a shaken house of voxels, and a demo scene's conforming mesh."""
-    return house_mesh() if request.param == "house" else demo_mesh("hot-object", 24)
+    return tagged_mesh if request.param == "house" else demo_mesh("hot-object", 24)
 
 
 @pytest.fixture(scope="session")

@@ -8,14 +8,20 @@ from scipy import sparse
 from skfem.models.poisson import laplace
 
 from tests.support.heat_meshes import mesh_from
-from tests.support.small_fields import crossed_diagonals
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_sides
-from thermoxels_ns.mesh.quality.tet_shapes import TetShapes, shapes_in_chunks
 from thermoxels_ns.mesh.temperature import tet_conductances
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
+
+
+def crossed_diagonals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two voxels side by side, and the same with the second mirrored: diagonals on the face that they share cross."""
+    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
+    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
+    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
+    return corners.astype(float), tets, np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
 
 
 def _turned_over(mesh):
@@ -101,23 +107,6 @@ def test_angles_of_voxels_are_right_in_national_coordinates_too(box_mesh, shift_
     turn *= np.sign(np.linalg.det(turn))
     figures = check_mesh(replace(box_mesh, points_m=0.05 * box_mesh.points_m @ turn.T + shift_m))
     assert figures.dihedral_range_deg == pytest.approx((45.0, 90.0), abs=1e-4)
-
-
-REGULAR = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
-ONE = np.array([[0, 1, 2, 3]])
-
-
-def shapes_of(points: np.ndarray, tets: np.ndarray = ONE) -> TetShapes:
-    return next(shapes_in_chunks(points, tets))[1]
-
-
-def test_regular_tetrahedron():
-    shapes = shapes_of(REGULAR)
-    cosines = shapes.dihedral_cosines()
-    assert cosines[:, 0] == pytest.approx([1 / 3] * 6)
-    assert shapes.volumes.tolist() == pytest.approx([8 / 3])
-    # Edge length l: each edge adds -cot(angle) l / 6 = -l / (6 sqrt 8).
-    assert shapes.stiffness()[:, 0] == pytest.approx([-np.sqrt(8) / (6 * np.sqrt(8))] * 6)
 
 
 def test_stiffness_is_that_of_scikit_fem():
