@@ -225,7 +225,6 @@ def test_start_and_up() -> None:
     mesh = room()
     scene = HeatScene(ALL, adiabatic=("*",))
     np.testing.assert_array_equal(scene.problem(mesh).start_c, mesh.temperature_c)
-    np.testing.assert_array_equal(replace(scene, initial_c=3).problem(mesh).start_c, np.full(len(mesh.points_m), 3.0))
     assert scene.problem(mesh).up == (0.0, 0.0, 1.0)
     assert scene.problem(mesh, up=(0.0, 2.0, 0.0)).up == (0.0, 1.0, 0.0)
     assert replace(scene, up=(3.0, 0.0, 0.0)).problem(mesh, up=(0.0, 1.0, 0.0)).up == (1.0, 0.0, 0.0)
@@ -244,13 +243,11 @@ PLACE = {"latitude_deg": 47.0, "longitude_deg": 8.0, "north": (0.0, 1.0, 0.0)}
         (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches"),
         (lambda: InsideAir(-300.0, "iso-6946-combined"), "air_c"),
         (lambda: InsideAir(float("nan"), "iso-6946-combined"), "air_c"),
-        (lambda: InsideAir(True, "iso-6946-combined"), "air_c"),
         (lambda: Surface(), "expected emissivity, absorptivity"),
         (lambda: Surface(emissivity=1.5), "emissivity"),
         (lambda: Sky(below_air_k=-6.0), "below_air_k"),
         (lambda: Sun(start=NOON, clear_sky="meinel"), "start"),
         (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2"),
-        (lambda: Sun(start=NOON.replace(tzinfo=None), **PLACE, clear_sky="meinel"), "start"),
         (lambda: Sun(start=NOON, **{**PLACE, "north": (0.0, 0.0, 0.0)}, clear_sky="meinel"), "north"),
         (lambda: Sun(towards=(0.0, 0.0, 1.0), latitude_deg=47.0, direct_w_m2=800.0), "latitude_deg"),
     ],
@@ -281,22 +278,8 @@ def test_every_row_is_a_material_with_a_source() -> None:
         low, high = (10.0, 400.0) if name in metals else (0.02, 0.08) if row.density_kg_m3 <= 250.0 else (0.05, 4.0)
         assert low <= row.conductivity_w_mk <= high, name
     assert all(100 < row.specific_heat_j_kgk < 2000 for row in table.values())
-
-
-@pytest.mark.parametrize(
-    ("name", "figures"),
-    [
-        ("concrete", (1.7, 2200.0, 880.0)),
-        ("aluminium", (160.0, 2800.0, 880.0)),
-        ("softwood", (0.13, 500.0, 1600.0)),
-        ("mineral-wool", (0.035, 20.0, 1030.0)),
-    ],
-)
-def test_published_rows(name: str, figures: tuple[float, float, float]) -> None:
-    found = material(name)
-    assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures
-
-
-def test_an_unknown_material_lists_the_known_and_suggests_one() -> None:
-    with pytest.raises(HeatError, match=r"^material: .* Did you mean concrete"):
-        material("concret")
+    published = {"concrete": (1.7, 2200.0, 880.0), "aluminium": (160.0, 2800.0, 880.0)}
+    published |= {"softwood": (0.13, 500.0, 1600.0), "mineral-wool": (0.035, 20.0, 1030.0)}
+    for name, figures in published.items():
+        found = table[name]
+        assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures

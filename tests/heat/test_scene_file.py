@@ -117,7 +117,7 @@ STEPS = SMALL.replace("steady: true", "time: {}")
     [
         ("steady: true\n", "the key materials"),
         (SMALL.replace("true", "maybe"), "steady"),
-        (SMALL.replace("concrete", "cheese"), "material: .*cheese"),
+        (SMALL.replace("concrete", "concret"), "material: .*Did you mean concrete"),
         (SMALL.replace("concrete", "{conductivity_w_mk: 0, density_kg_m3: 1, specific_heat_j_kgk: 1}"),
          r"materials: \*: conductivity_w_mk"),
         (SMALL + "initial: warm\n", "initial"),

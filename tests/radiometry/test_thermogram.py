@@ -120,7 +120,6 @@ def test_pixels_that_cannot_be_under_the_settings_are_masked_and_counted(tmp_pat
         ({"celsius_offset": 0.0}, "or neither"),
         ({"celsius_per_count": 0.0, "celsius_offset": 0.0}, "other than 0"),
         ({"celsius_per_count": 0.1, "celsius_offset": 0.0, "camera": "workswell"}, "a preset or a scale"),
-        ({"emissivity": 1.5}, "emissivity"),
     ],
 )
 def test_options_that_cannot_be_are_refused_at_once(values, said):
