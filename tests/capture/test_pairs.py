@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.camera_card import counts, jpeg_bytes, photograph
-from tests.support.flir_file import FlirFile
+from tests.support.camera_card import counts, photograph
+from tests.support.flir_file import FlirFile, picture_bytes
 from thermoxels_ns.capture.folder_scan import CameraFile, CameraFolder, scan_folder
 from thermoxels_ns.capture.pairs import PairSearch, find_pairs
 
@@ -107,7 +107,7 @@ def card(tmp_path):
     folder = tmp_path / "card"
     photograph(folder / "1-visible.jpg")
     counts(folder / "1-radiometric.tiff")
-    flir = FlirFile(np.full((6, 8), 14000, dtype=np.uint16), photograph=jpeg_bytes(np.zeros((24, 32, 3), np.uint8)))
+    flir = FlirFile(np.full((6, 8), 14000, dtype=np.uint16), photograph=picture_bytes(np.zeros((24, 32, 3), np.uint8)))
     (folder / "FLIR2.jpg").write_bytes(flir.jpeg())
     (folder / "log.txt").write_text("not ours")
     return folder

@@ -237,7 +237,6 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     scene, folder = written
     outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
     tracks = find_tracks(read_scene_file(folder))
-    assert tracks is not None
     np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
     np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
     assert sorted(map(len, tracks.seen.values())) == sorted(map(len, scene.model.seen))

@@ -41,9 +41,7 @@ def add_model(
 
 
 def tracks_of(folder) -> SparseTracks:
-    found = find_tracks(read_scene_file(folder.path))
-    assert found is not None
-    return found
+    return find_tracks(read_scene_file(folder.path))
 
 
 def lines_of(folder, split="train", **options):

@@ -64,9 +64,7 @@ def compared(
     truth: KnownTruth | Path, snapshot: GridSnapshot, world_to_input: np.ndarray = IDENTITY, *mesh: Any
 ) -> dict:
     """Figures of all solid voxels, and of a mesh of them with its metres per unit."""
-    found = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, world_to_input, truth, *mesh)
-    assert found is not None
-    return found
+    return compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, world_to_input, truth, *mesh)
 
 
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):

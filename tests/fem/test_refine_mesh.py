@@ -32,7 +32,6 @@ def notched() -> TetMesh:
         keep=lambda p: (p[..., 0] < 2) | (p[..., 1] < 1),
     )
     tags = mesh.boundary
-    assert tags is not None
     return replace(
         mesh,
         boundary=replace(tags, seen=tags.patch % 2 == 0),
@@ -62,7 +61,6 @@ def test_children_inherit() -> None:
     mesh = notched()
     fine = refine_mesh(mesh)
     tags, finer = mesh.boundary, fine.boundary
-    assert mesh.colour is not None and fine.colour is not None
     np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
     for name in ("patch", "seen"):
         np.testing.assert_array_equal(getattr(finer, name), np.repeat(getattr(tags, name), 4, axis=0))

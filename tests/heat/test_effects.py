@@ -63,13 +63,6 @@ def test_positive_is_into_the_body(box, concrete, effect, watts) -> None:
     assert np.sign(mean_change) == np.sign(watts)
 
 
-def test_heat_per_patch(box, concrete) -> None:
-    heat = at_once(box, concrete, HeatFlux(("x?", "z1"), 100.0)).effects[0]
-    assert heat.group_names == ("x0", "x1", "z1")
-    np.testing.assert_allclose(heat.group_heat_w[0], 100.0 * np.array([AREA_X, AREA_X, 0.12]), rtol=1e-12)
-    assert heat.heat_w[0] == pytest.approx(heat.group_heat_w.sum(), rel=1e-12)
-
-
 def test_a_star_is_the_whole_boundary_also_without_tags(box, concrete) -> None:
     area = 2 * (0.4 * 0.3 + 0.4 * 0.2 + 0.3 * 0.2)
     for mesh in (box, replace(box, boundary=None)):

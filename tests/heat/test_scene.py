@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import TimeSteps, Varying, values_at
+from thermoxels_ns.fem.problem import TimeSteps, values_at
 from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
@@ -44,12 +44,6 @@ def test_a_mesh_without_temperatures_starts_from_those_of_the_scene() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_what_is_not_named_is_not_built() -> None:
-    assert effects() == ()
-    (alone,) = effects(outside_air=OUTSIDE)
-    assert alone == Convection(("exterior-*",), 25.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("air", "h"),
     [
@@ -63,7 +57,6 @@ def test_what_is_not_named_is_not_built() -> None:
 )
 def test_outside_air(air: OutsideAir, h: float) -> None:
     (effect,) = effects(outside_air=air)
-    assert isinstance(effect, Convection)
     assert effect.coefficient_w_m2k == pytest.approx(h, rel=1e-4)
 
 
@@ -108,7 +101,6 @@ def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
 )
 def test_sky_alone(sky: Sky, sky_c: float) -> None:
     _, radiation = effects(outside_air=CONVECTION, sky=sky, surfaces=(Surface(emissivity=0.9),))
-    assert isinstance(radiation, Radiation)
     assert radiation.surroundings_c == sky_c
 
 
@@ -261,7 +253,6 @@ def test_horizontal_reaches_to_30_degrees() -> None:
     angle = np.radians([-31, -30, -29, 29, 30, 31])
     normals = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
     coefficient = InsideAir(20.0, "iso-6946-convection", heat_flow="out-of-body").convection().coefficient_w_m2k
-    assert isinstance(coefficient, Varying)
     found = coefficient.function(Places(np.zeros((6, 3)), normals, (0.0, 0.0, 1.0)), 0.0)
     assert np.asarray(found).tolist() == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
 

@@ -49,7 +49,6 @@ def test_the_original_s_transient_case() -> None:
     assert found.time == TimeSteps(10, 60.0)
     inside, outside, radiation, solar = found.effects(room())
     assert inside == Convection(("interior-*",), 8.0, 30.0)
-    assert isinstance(outside, Convection)
     assert (outside.patches, outside.air_c) == (("exterior-*",), 10.0)
     assert outside.coefficient_w_m2k == pytest.approx(18.6 * 5.56**0.605)
     assert radiation == Radiation(("exterior-*",), 0.85, 10.0, 5.67e-8)
@@ -255,7 +254,6 @@ surfaces: [{emissivity: 90 %, absorptivity: 0.6}]
 sun: {towards: [0, -1, 1], direct_w_m2: 500 W/m2}
 """,
     )
-    assert found.outside_air is not None and found.ground is not None and found.time is not None
     assert (found.outside_air.air_c, found.outside_air.wind_m_s) == (-5.5, pytest.approx(1.0))
     assert (found.time.duration_s, found.initial_c) == (86400.0, pytest.approx(15.0))
     assert (found.ground.surface_c, found.ground.reflectance, found.surfaces[0].emissivity) == (10.0, 0.2, 0.9)

@@ -75,7 +75,6 @@ HARD: dict[str, Callable[[], np.ndarray]] = {
 def assert_sound(built: BuiltMesh, mode: str) -> None:
     mesh, boundary = built.mesh, built.mesh.boundary
     quality = check_mesh(mesh)  # volumes above 0, conforming, closed
-    assert mesh.colour is not None
     low, high = (10.7, 164.8) if mode == "conforming" else (45.0 - 1e-6, 90.0 + 1e-6)
     assert low <= quality.dihedral_range_deg[0] and quality.dihedral_range_deg[1] <= high
     assert mesh.observed.any()

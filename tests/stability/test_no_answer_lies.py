@@ -80,7 +80,6 @@ def layers(
     # `box_mesh` finds sides to 1e-12 m.
     across = np.abs(mesh.points_m[mesh.facets][..., 0] - mesh.points_m[mesh.facets][:, :1, 0]).max(axis=1) == 0.0
     middle, tags = mesh.points_m[mesh.facets][..., 0].mean(axis=1), mesh.boundary
-    assert tags is not None
     patch = np.where(across, np.where(middle < 0.5 * sides[0], 0, 1), 2)
     mesh = replace(mesh, boundary=replace(tags, patch=patch))
     spread = rng.uniform(1.0, 12.0) if "contrast" in hostile else 0.7

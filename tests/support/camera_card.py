@@ -1,6 +1,5 @@
 """Small camera files for tests: photographs with EXIF, count images, and a FLIR file with a photograph inside."""
 
-import io
 from datetime import datetime
 from pathlib import Path
 
@@ -74,9 +73,3 @@ def write_pairs(card: Path, names: str = "abc") -> Path:
         photograph(card / f"{name}-visible.jpg")
         counts(card / f"{name}-radiometric.tiff")
     return card
-
-
-def jpeg_bytes(pixels: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, format="JPEG", quality=95)
-    return stream.getvalue()

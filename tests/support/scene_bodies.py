@@ -9,19 +9,16 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 Z_UP = (0.0, 0.0, 1.0)
 
 
-def tagged_body(
-    cells: np.ndarray, voxel_m: float, outside: np.ndarray, cut_below_x: float = 0.0, temperature_c: float = 15.0
-) -> TetMesh:
-    """A body of voxels with the default patches and the regions solid and slab (empty).
+def tagged_body(cells: np.ndarray, voxel_m: float, outside: np.ndarray, cut_below_x: float = 0.0) -> TetMesh:
+    """A body of voxels at 15 C with the default patches and the regions solid and slab (empty).
 
     Args:
         cells: Which voxels are solid.
         voxel_m: Their size.
         outside: True for voxels beyond which photographs look, on a lattice two larger that starts one voxel earlier.
         cut_below_x: Facets whose middle has an x below it, in voxels, are cut by the box around the scene.
-        temperature_c: Of all nodes.
     """
-    mesh = make_body(cells, voxel_m, temperature_c)
+    mesh = make_body(cells, voxel_m, 15.0)
     corners = np.rint(mesh.points_m / voxel_m)
     normals, middle = facet_normals(corners, mesh.facets), corners[mesh.facets].mean(axis=1)
     beyond = np.floor(middle + 0.5 * normals).astype(int) + 1

@@ -9,9 +9,7 @@ from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
-def shell_mesh(
-    inner_m: float, outer_m: float, parts: int, layers: int, *, temperature_c: float = 20.0, eighth: bool = False
-) -> TetMesh:
+def shell_mesh(inner_m: float, outer_m: float, parts: int, layers: int, *, eighth: bool = False) -> TetMesh:
     """Cut the shell into cells and each cell into six tetrahedra.
 
     Each of the six sides of the cube is made of four mirrored quarters, so that the diagonals of all of them meet.
@@ -21,7 +19,6 @@ def shell_mesh(
         outer_m: Of the outer one.
         parts: Cells along half an edge of the cube.
         layers: Cells from sphere to sphere.
-        temperature_c: Temperature of all nodes, [degrees Celsius].
         eighth: Only what lies between the positive axes; nothing flows through its cuts.
 
     Returns:
@@ -40,7 +37,7 @@ def shell_mesh(
     every = np.concatenate(points)
     _, first, number = np.unique(np.round(every / outer_m, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
     nodes, tets = every[first], number.ravel()[np.concatenate(blocks)]
-    mesh = mesh_from(nodes, tets, temperature_c)
+    mesh = mesh_from(nodes, tets)
     corner, facets = nodes[mesh.facets], mesh.facets
     radius = np.linalg.norm(corner, axis=2)
     patch = np.full(len(facets), 2)

@@ -8,6 +8,7 @@ import skfem
 from scipy import sparse
 from skfem.models.poisson import laplace
 
+from tests.support.heat_meshes import mesh_from
 from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
@@ -17,16 +18,8 @@ ANGLE_BOUNDS_DEG = (10.7, 164.8)
 
 
 def tet_mesh(solid: StuffedSolid, voxel_size: float = 1.0) -> TetMesh:
-    nodes = len(solid.points)
-    return TetMesh(
-        points_m=solid.points * voxel_size,
-        tets=solid.tets,
-        temperature_c=np.zeros(nodes),
-        observed=np.ones(nodes, dtype=bool),
-        facets=solid.facets,
-        facet_tags=np.where(solid.on_box, FACET_BOX, FACET_SURFACE),
-        region=np.zeros(len(solid.tets), dtype=np.int64),
-    )
+    tags = np.where(solid.on_box, FACET_BOX, FACET_SURFACE)
+    return mesh_from(solid.points * voxel_size, solid.tets, 0.0, facets=solid.facets, facet_tags=tags)
 
 
 def on_surface(solid: StuffedSolid) -> np.ndarray:
