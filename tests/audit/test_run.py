@@ -22,7 +22,7 @@ from tests.support.audited_wall import (
     solve_wall,
     true_draws,
 )
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import box_mesh, planes
 from thermoxels_ns.audit.conditions import (
     Camera,
     Energy,

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.camera_card import counts, photograph
-from tests.support.flir_file import FlirFile, picture_bytes
+from tests.support.camera_card import FlirFile, counts, photograph, picture_bytes
 from thermoxels_ns.capture.frames import read_frames
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import read_photograph_facts

@@ -15,8 +15,8 @@ import pyvista as pv
 from PIL import Image, ImageFile
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
-from tests.support.flat_houses import house_corner
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.demo_mesh import house_corner
+from tests.support.heat_bodies import box_mesh, planes
 from thermoxels_ns import cli
 from thermoxels_ns.audit.compare import earlier_conditions
 from thermoxels_ns.audit.run import audit

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.support.audited_wall import STATED, UP
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import box_mesh, planes
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.commands.audit_photographs import photographs_of_defects
 from thermoxels_ns.core.camera import Camera

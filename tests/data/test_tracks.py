@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.support.colmap_model import write_colmap_model
+from tests.support.posed_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, matched_names
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.demo_mesh import demo_mesh
 from tests.support.heat_bodies import CONCRETE
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _LONGEST_RUN_S = 300
@@ -26,12 +26,6 @@ def solid_mesh(request: pytest.FixtureRequest, tagged_mesh: TetMesh) -> TetMesh:
 def heat_problem(solid_mesh) -> HeatProblem:
     """Conduction in it, as concrete."""
     return HeatProblem(solid_mesh, CONCRETE)
-
-
-@pytest.fixture(scope="session")
-def ten_steps() -> TimeSteps:
-    """Ten hours, in which heat goes about as far as a wall is thick."""
-    return TimeSteps(10, 3600.0)
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import CONCRETE, box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from tests.support.heat_matrices import storage
-from tests.support.heat_meshes import box_mesh, mesh_from
-from tests.support.shell_mesh import shell_mesh
+from tests.support.heat_bodies import box_mesh, mesh_from, shell_mesh, storage
 from thermoxels_ns.fem.linear_tets import TET_EDGES, lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.selection import Selection

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import STEEL
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import STEEL, box_mesh, planes
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space

@@ -4,8 +4,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from tests.support.heat_bodies import CONCRETE, STEEL
-from tests.support.heat_meshes import SIDES, box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, SIDES, STEEL, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.implicit_equation import LinearSolver

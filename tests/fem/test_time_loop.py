@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
-from tests.support.heat_bodies import CONCRETE, STEEL
-from tests.support.heat_matrices import assemble
-from tests.support.heat_meshes import SIDES, box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, SIDES, STEEL, assemble, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Quantity, TimeSteps, Varying, tabulated
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying, tabulated
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
@@ -105,14 +103,11 @@ TIMES_S = np.array([0.0, 100.0, 101.0, 102.0, 200.0]) * HOUR_S
 FLASH = np.array([0.0, 0.0, 500.0, 0.0, 0.0])
 
 
-def warmed(flux: Quantity, time: TimeSteps | AdaptiveSteps):
-    mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
-    return solve_heat(HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), flux),)), time)
-
-
 def test_adaptive_steps_do_not_step_over_a_table() -> None:
     """Two hours of heat in a week: a triangle of 500 W/m2, 1800 kJ/m2 in all."""
-    solution = warmed(tabulated(TIMES_S, FLASH), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
+    mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
+    problem = HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), tabulated(TIMES_S, FLASH)),))
+    solution = solve_heat(problem, AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
     brought_j = float(solution.heat_w[0]) * TIMES_S[-1]
     assert brought_j == pytest.approx(500.0 * HOUR_S * 0.01, rel=0.05)
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import ConvectionForm, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying

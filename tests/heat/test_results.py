@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import pyvista
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, box_mesh, planes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.boxed_scene import write_boxed_scene
 from tests.support.plane_photographs import EYES, SIZE, photographs
-from tests.support.short_training import train
+from tests.support.short_training import train, write_boxed_scene
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.multiview.evidence import evidence_of_photographs
@@ -30,11 +29,6 @@ def scene(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def untrained(scene):
-    return train(scene, 0, {})
-
-
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
     seen = photographs()
     depth = np.full(len(seen.colours), np.nan, np.float32)
@@ -52,7 +46,8 @@ def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
         assert error == pytest.approx(ERROR_PLANES * 0.02 * slope, rel=1e-5)
 
 
-def test_most_lines_of_a_scene_end_at_its_surface(untrained):
+def test_most_lines_of_a_scene_end_at_its_surface(scene):
+    untrained = train(scene, 0, {})
     lattice = untrained.model.grid.lattice
     found = evidence_of_photographs(untrained.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, print)
     assert found is not None and len(found.feature_rays.points) > 200

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.camera_card import counts, photograph
-from tests.support.flir_file import FlirFile, dji_jpeg, picture_bytes, segment, smooth_counts
+from tests.support.camera_card import FlirFile, counts, dji_jpeg, photograph, picture_bytes, segment, smooth_counts
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError

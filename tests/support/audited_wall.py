@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import box_mesh, planes
 from thermoxels_ns.audit.calibration import Calibration
 from thermoxels_ns.audit.conditions import (
     BALANCE,

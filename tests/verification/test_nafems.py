@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import nafems_t3
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh, nafems_t3
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady

@@ -4,9 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, graded, planes
-from tests.support.shell_mesh import shell_mesh
+from tests.support.heat_bodies import CONCRETE, box_mesh, graded, planes, shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.runge_kutta import SDIRK2

@@ -36,10 +36,6 @@ def sections(path: Path) -> dict[str, list[list[str]]]:
     return found
 
 
-def numbers(lines: list[list[str]]) -> list[int]:
-    return [int(field) for line in lines for field in line]
-
-
 @pytest.fixture
 def written(tmp_path, tagged_mesh) -> dict[str, list[list[str]]]:
     write_inp(tmp_path / "house.inp", tagged_mesh)
@@ -67,7 +63,8 @@ def test_surfaces_are_the_faces_with_the_nodes_of_the_patch(written, tagged_mesh
             for element, face in written[f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT"]
         ]
         assert np.array_equal(np.sort(faces, axis=1), np.sort(facets, axis=1))
-        assert numbers(written[f"*NSET, NSET=PATCH-{name}"]) == (np.unique(facets) + 1).tolist()
+        nodes = [int(field) for line in written[f"*NSET, NSET=PATCH-{name}"] for field in line]
+        assert nodes == (np.unique(facets) + 1).tolist()
 
 
 def test_empty_parts_are_left_out(written):

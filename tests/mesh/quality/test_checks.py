@@ -7,7 +7,7 @@ import skfem
 from scipy import sparse
 from skfem.models.poisson import laplace
 
-from tests.support.heat_meshes import mesh_from
+from tests.support.heat_bodies import mesh_from
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_sides
 from thermoxels_ns.mesh.temperature import tet_conductances
