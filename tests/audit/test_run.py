@@ -23,15 +23,7 @@ from tests.support.audited_wall import (
     true_draws,
 )
 from tests.support.heat_bodies import box_mesh, planes
-from thermoxels_ns.audit.conditions import (
-    Camera,
-    Energy,
-    Film,
-    Limits,
-    OutsideAir,
-    Reference,
-    Surface,
-)
+from thermoxels_ns.audit.conditions import Camera, Energy, Film, Limits, OutsideAir, Reference, Surface
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
 from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw
 from thermoxels_ns.audit.heat_flow import FILMS, net_radiation_w_m2, simple_models

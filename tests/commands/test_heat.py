@@ -11,7 +11,7 @@ import pytest
 import pyvista as pv
 import tyro
 
-from tests.support.scene_bodies import room, tagged_body, wall
+from tests.support.heat_bodies import room, tagged_body, wall
 from tests.support.unreadable import contents, files_end_after
 from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat

@@ -3,8 +3,7 @@ import pytest
 
 import thermoxels_ns
 from tests.support.docs_code import code_in
-from tests.support.heat_bodies import assemble, backward_euler
-from tests.support.scene_bodies import tagged_body
+from tests.support.heat_bodies import assemble, backward_euler, tagged_body
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.files.solvers import write_xdmf
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes

@@ -4,7 +4,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from tests.support.scene_bodies import room, wall
+from tests.support.heat_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import TimeSteps, values_at
 from thermoxels_ns.fem.selection import Places, Selection
@@ -12,14 +12,7 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import material, material_table
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import (
-    Ground,
-    InsideAir,
-    OutsideAir,
-    Sky,
-    Sun,
-    Surface,
-)
+from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
 from thermoxels_ns.heat.sky import swinbank_sky_c
 
 ALL = {"*": material("concrete")}

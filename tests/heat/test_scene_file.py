@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from tests.support.epw_file import write_epw
-from tests.support.scene_bodies import room
+from tests.support.heat_bodies import room
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps, Varying, values_at
@@ -53,14 +53,6 @@ def test_the_original_s_transient_case() -> None:
     assert outside.coefficient_w_m2k == pytest.approx(18.6 * 5.56**0.605)
     assert radiation == Radiation(("exterior-*",), 0.85, 10.0, 5.67e-8)
     assert solar == AbsorbedSolar(("exterior-*",), 0.6, 1000.0)
-
-
-def test_winter_night() -> None:
-    found = load_heat_scene("winter-night")
-    assert found.steady
-    inside, outside = found.effects(room())
-    assert isinstance(inside, Convection) and isinstance(inside.coefficient_w_m2k, Varying)
-    assert outside == Convection(("exterior-*",), 25.0, 0.0)
 
 
 def test_all_effects() -> None:

@@ -12,14 +12,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Var
 from thermoxels_ns.fem.solution import SteadySolution, mean_flows_w
 from thermoxels_ns.fem.tolerance import LEAVE_OUT_BELOW
 from thermoxels_ns.heat import solving as heat_solving
-from thermoxels_ns.heat.effects import (
-    AbsorbedSolar,
-    Convection,
-    FixedTemperature,
-    HeatFlux,
-    InternalHeat,
-    Radiation,
-)
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene_fields import Sun
 from thermoxels_ns.heat.solving import Goals, solve_problem

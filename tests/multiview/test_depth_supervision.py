@@ -11,11 +11,7 @@ from tests.support.short_training import train, write_boxed_scene
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.multiview.evidence import evidence_of_photographs
-from thermoxels_ns.multiview.stereo import (
-    ERROR_PLANES,
-    Depths,
-    feature_rays_to_depths,
-)
+from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths, feature_rays_to_depths
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss

@@ -17,11 +17,7 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsEr
 from thermoxels_ns.radiometry.decoders import LARGEST_SIDE
 from thermoxels_ns.radiometry.measurement_model import Conditions, RadiometryOptions, corrected_temperature_c
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
-from thermoxels_ns.radiometry.thermogram import (
-    COUNT_SCALES,
-    read_thermogram,
-    recognised_camera,
-)
+from thermoxels_ns.radiometry.thermogram import COUNT_SCALES, read_thermogram, recognised_camera
 
 WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
 

@@ -11,14 +11,7 @@ import pyvista as pv
 
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.files import solvers
-from thermoxels_ns.mesh.files.solvers import (
-    BODY_GRID,
-    FACET_GRID,
-    TEMPERATURE_VIEW,
-    write_inp,
-    write_msh,
-    write_xdmf,
-)
+from thermoxels_ns.mesh.files.solvers import BODY_GRID, FACET_GRID, TEMPERATURE_VIEW, write_inp, write_msh, write_xdmf
 
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
 FACE_NODES = {1: (1, 2, 3), 2: (1, 4, 2), 3: (2, 4, 3), 4: (3, 4, 1)}
