@@ -22,26 +22,26 @@ SUN = Sun(datetime(2026, 1, 10, tzinfo=timezone.utc), 47.0, 0.0, (0.0, 1.0, 0.0)
 
 
 @pytest.mark.parametrize("temperature_c", [-273.15, -40.0, 0.1, 20.0, 1500.3])
-def test_uniform_temperature_does_not_change_at_all(random_body, concrete, temperature_c) -> None:
+def test_uniform_temperature_does_not_change_at_all(random_body, temperature_c) -> None:
     start = np.full(len(random_body.points_m), temperature_c)
-    solution = solve_heat(HeatProblem(random_body, concrete, start), PAPER)
+    solution = solve_heat(HeatProblem(random_body, CONCRETE, start), PAPER)
     np.testing.assert_array_equal(solution.temperature_c, temperature_c)
     assert solution.energy_residual == 0.0
 
 
-def test_failure_to_converge_raises(random_body, concrete, monkeypatch) -> None:
+def test_failure_to_converge_raises(random_body, monkeypatch) -> None:
     monkeypatch.setattr("thermoxels_ns.fem.implicit_equation.MOST_UNBALANCED", 0.0)
     with pytest.raises(HeatError, match=r"The step from 0 s failed.*are not balanced"):
-        solve_heat(HeatProblem(random_body, concrete), PAPER)
+        solve_heat(HeatProblem(random_body, CONCRETE), PAPER)
 
 
 @pytest.mark.parametrize("outputs", [1, 10])
-def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: int) -> None:
+def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(outputs: int) -> None:
     """Nothing flows at midnight; a step as long as an interval would end at midnight again."""
     mesh = box_mesh(*(planes(0.0, 0.2, step=0.1) for _ in range(3)))
     mesh = replace(mesh, temperature_c=np.full(len(mesh.points_m), 5.0))
     sun = AbsorbedSolar(SIDES, 0.7, SUN.irradiance())
-    problem = HeatProblem(mesh, concrete, effects=(Convection(SIDES, 10.0, 5.0), sun))
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(SIDES, 10.0, 5.0), sun))
     days = solve_heat(problem, AdaptiveSteps(4 * 86400.0, outputs=outputs))
     assert days.steps >= 96  # one an hour at least
     fine = solve_heat(problem, TimeSteps(4 * 24 * 12, 300.0))
@@ -72,11 +72,11 @@ def test_equal_steps_tell_their_error(radiates) -> None:
 
 @pytest.mark.parametrize("scheme", [BACKWARD_EULER, SDIRK2])
 @pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
-def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:
+def test_newton_takes_few_steps_however_short_the_time_step(scheme, step_s) -> None:
     """Of two plates that do not touch, at 20 and 60 C."""
     x, apart = [0.0, 0.01, 0.02, 0.03], lambda p: np.abs(p[..., 0] - 0.015) > 0.005
     mesh = box_mesh(x, x, x[:2], keep=apart, temperature_c=lambda p: np.where(p[:, 0] > 0.015, 60.0, 20.0))
-    problem = HeatProblem(mesh, concrete, effects=(Radiation(("x1",), 0.9, 306.6),))
+    problem = HeatProblem(mesh, CONCRETE, effects=(Radiation(("x1",), 0.9, 306.6),))
     solution = solve_heat(problem, TimeSteps(3, step_s), scheme=scheme)
     assert solution.newton_iterations.max() <= 3 * len(scheme.nodes)
     # As long as nothing has changed to speak of, the heat is that of the first moment.
@@ -85,11 +85,11 @@ def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, st
     np.testing.assert_allclose(solution.effects[0].heat_w, heat, rtol=1e-4)
 
 
-def test_newton_ends_near_a_steady_state_and_after_it(concrete) -> None:
+def test_newton_ends_near_a_steady_state_and_after_it() -> None:
     """Restarts from what is all but steady: the residual begins at round-off and has nowhere to go."""
     effects = (Radiation(("x1",), 0.9, 306.6), Convection(("x0",), 8.0, 10.0))
     mesh = box_mesh(*[np.arange(4) * 0.05] * 3, temperature_c=100.0)
-    problem = HeatProblem(mesh, concrete, effects=effects)
+    problem = HeatProblem(mesh, CONCRETE, effects=effects)
     steady = solve_steady(problem).temperature_c
     for away in (0.0, 1e-12, 1e-9, 1e-6):
         near = replace(problem, initial_temperature_c=steady + away * np.sin(np.arange(len(steady))))

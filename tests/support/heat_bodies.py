@@ -120,11 +120,12 @@ def box_mesh(
 
 
 def _tags(points, facets, axes, patches) -> Boundary:
-    normal, centroid = facet_normals(points, facets), points[facets].mean(axis=1)
+    corner, normal = points[facets], facet_normals(points, facets)
+    centroid = corner.mean(axis=1)
     names = (*SIDES, "other", *(name for name in patches if name not in SIDES))
     patch = np.full(len(facets), names.index("other"))
     for side, (axis, end) in zip(SIDES, ((axis, end) for axis in range(3) for end in (0, -1))):
-        patch[np.isclose(centroid[:, axis], axes[axis][end], rtol=0, atol=1e-12)] = names.index(side)
+        patch[(corner[..., axis] == axes[axis][end]).all(axis=1)] = names.index(side)
     for name, rule in patches.items():
         patch[rule(centroid, normal)] = names.index(name)
     return Boundary(np.ones(len(facets), bool), patch, names)
@@ -137,11 +138,6 @@ STEEL = Material("steel", 50.0, 7800.0, 450.0)
 def make_body(cells: np.ndarray, voxel_m: float, temperature_c: Nodal = 20.0) -> TetMesh:
     corners, tets = kuhn_tets(cells)
     return mesh_from(corners * voxel_m, tets, temperature_c)
-
-
-@pytest.fixture
-def concrete() -> Material:
-    return CONCRETE
 
 
 @pytest.fixture
