@@ -10,7 +10,7 @@ import pyvista as pv
 
 import thermoxels_ns
 from tests.support.docs_code import DOCS
-from tests.support.scene_bodies import room
+from tests.support.heat_bodies import room
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.heat.scene import load_heat_scene

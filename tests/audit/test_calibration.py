@@ -9,6 +9,7 @@ import pytest
 from tests.support.audited_wall import (
     CONDUCTIVITY,
     STATED,
+    SURE,
     UP,
     Truth,
     audited_wall,
@@ -63,8 +64,8 @@ def test_two_materials_are_told_apart_where_each_has_a_surface(walls) -> None:
 
 def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
     """Drawn from -0.3 to 0.3 K: a twentieth of the draws is above 0.27 K, and so is a twentieth of the results."""
-    stated = calibrate(walls["plain"], WALL, replace(OFFSET_ALONE, **exact()))
-    shifted = replace(OFFSET_ALONE, camera=Camera(Measured(0.27), Measured(0.0)), **exact())
+    stated = calibrate(walls["plain"], WALL, replace(SURE, camera=OFFSET_ALONE.camera))
+    shifted = replace(SURE, camera=Camera(Measured(0.27), Measured(0.0)))
     mesh = photographed(walls["plain"], OFFSET_ALONE)
     warmer = audit(mesh, replace(shifted, calibrate=WALL), UP).calibration
     ends = [one.found["conductivity of wall"] for one in (stated, warmer)]
@@ -73,36 +74,19 @@ def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
 
 def test_each_formula_of_convection_is_followed_to_a_conductivity_of_its_own(walls) -> None:
     """Two formulas, in 1/4 and 3/4 of the draws: the ends of the interval are the values by one alone."""
-    sure = replace(OFFSET_ALONE, camera=Camera(Measured(0.0), Measured(0.0)), **exact())
     films = (Film(weights={"iso-6946": 1.0, "watmuff": 3.0}), Film("iso-6946"), Film("watmuff"))
     warm = replace(
         walls["plain"], mesh=replace(walls["plain"].mesh, temperature_c=walls["plain"].mesh.temperature_c + 1.0)
     )
-    both, iso, watmuff = (calibrate(warm, WALL, replace(sure, film=film)).found for film in films)
+    both, iso, watmuff = (calibrate(warm, WALL, replace(SURE, film=film)).found for film in films)
     interval, ends = both["conductivity of wall"], [one["conductivity of wall"].value for one in (watmuff, iso)]
     assert (interval.low, interval.high) == pytest.approx(ends, rel=5e-3) and ends[0] < 0.95 * ends[1]
-
-
-def exact() -> dict:
-    """Conditions without a range, the camera apart."""
-    return {
-        "inside": replace(STATED.inside, air=Measured(20.0)),
-        "outside": replace(STATED.outside, air=Measured(0.0), wind=Measured(1.0)),
-        "surroundings": replace(
-            STATED.surroundings,
-            sky=replace(STATED.surroundings.sky, cloud=Measured(0.7), dew_point=Measured(-4.0)),
-            ground=Measured(-0.5),
-        ),
-        "film": replace(STATED.film, factor=Measured(1.0)),
-        "surfaces": (replace(STATED.surfaces[0], emissivity=Measured(0.93)),),
-    }
 
 
 def test_what_is_known_to_a_range_widens_the_answer(walls) -> None:
     """The wall and plaster of 0.1 +- 0.05 m2 K / W together resist as the true wall; 90 % of draws are within 0.045."""
     layers = {"plaster": Layer(("room",), Measured(0.02, 0.01), Measured(0.2))}
-    sure = replace(STATED, camera=Camera(Measured(0.0), Measured(0.0)), **exact())
-    found = calibrate(walls["plain"], replace(WALL, layers=layers), sure).found["conductivity of wall"]
+    found = calibrate(walls["plain"], replace(WALL, layers=layers), SURE).found["conductivity of wall"]
     for value, plaster in ((found.low, 0.055), (found.value, 0.1), (found.high, 0.145)):
         assert 0.3 / value + plaster == pytest.approx(0.3 / CONDUCTIVITY["wall"], rel=2e-3)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from tests.support.flat_houses import house_corner
+from tests.support.demo_mesh import house_corner
 from thermoxels_ns.audit.conditions import Limits, load_conditions
 from thermoxels_ns.audit.envelope import Envelope, envelope_of, hbjson
 from thermoxels_ns.audit.run import audit

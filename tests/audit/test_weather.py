@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from tests.support.audited_wall import UP, audited_wall
 from tests.support.epw_file import write_epw
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh
 from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.audit.weather import remembered_share

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from measuring import print_head, print_row, take_turns
 
-from tests.support.scene_bodies import tagged_body
+from tests.support.heat_bodies import tagged_body
 from thermoxels_ns.fem.problem import TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene import load_heat_scene

@@ -30,9 +30,7 @@ import tyro
 from measuring import append_row, logarithmic_panels, save, take_turns
 
 from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE, finer, nafems_t3
-from tests.support.heat_meshes import planes
-from tests.support.shell_mesh import shell_mesh
+from tests.support.heat_bodies import CONCRETE, finer, nafems_t3, planes, shell_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.camera_card import counts, jpeg_bytes, photograph
-from tests.support.flir_file import FlirFile
+from tests.support.camera_card import FlirFile, counts, photograph, picture_bytes
 from thermoxels_ns.capture.frames import read_frames
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import read_photograph_facts
@@ -40,7 +39,7 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     pixels = np.full((24, 32, 3), (200, 30, 30), dtype=np.uint8)
     card = tmp_path / "card"
     card.mkdir()
-    flir = FlirFile(np.full((12, 16), 14000, np.uint16), photograph=jpeg_bytes(pixels), alignment=(1.2, 3, -4))
+    flir = FlirFile(np.full((12, 16), 14000, np.uint16), photograph=picture_bytes(pixels), alignment=(1.2, 3, -4))
     (card / "F.jpg").write_bytes(flir.jpeg())
     (frame,) = read([Pair("F.jpg", "F.jpg", "")], tmp_path).frames
     assert np.asarray(Image.open(frame.photograph)).mean(axis=(0, 1)) == pytest.approx((200, 30, 30), abs=3)

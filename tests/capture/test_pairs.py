@@ -4,8 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.camera_card import counts, jpeg_bytes, photograph
-from tests.support.flir_file import FlirFile
+from tests.support.camera_card import FlirFile, counts, photograph, picture_bytes
 from thermoxels_ns.capture.folder_scan import CameraFile, CameraFolder, scan_folder
 from thermoxels_ns.capture.pairs import PairSearch, find_pairs
 
@@ -102,18 +101,13 @@ def test_every_file_is_in_a_pair_or_explained():
     assert not set(paired) & set(search.unpaired)
 
 
-@pytest.fixture
-def card(tmp_path):
-    folder = tmp_path / "card"
-    photograph(folder / "1-visible.jpg")
-    counts(folder / "1-radiometric.tiff")
-    flir = FlirFile(np.full((6, 8), 14000, dtype=np.uint16), photograph=jpeg_bytes(np.zeros((24, 32, 3), np.uint8)))
-    (folder / "FLIR2.jpg").write_bytes(flir.jpeg())
-    (folder / "log.txt").write_text("not ours")
-    return folder
-
-
-def test_a_card_is_read_by_content(card):
+def test_a_card_is_read_by_content(tmp_path):
+    card = tmp_path / "card"
+    photograph(card / "1-visible.jpg")
+    counts(card / "1-radiometric.tiff")
+    flir = FlirFile(np.full((6, 8), 14000, dtype=np.uint16), photograph=picture_bytes(np.zeros((24, 32, 3), np.uint8)))
+    (card / "FLIR2.jpg").write_bytes(flir.jpeg())
+    (card / "log.txt").write_text("not ours")
     (card / "3-visible.jpg").write_bytes(b"")
     (card / "4-visible.jpg").write_bytes(b"no picture at all")
     (card / ".trash").mkdir()

@@ -67,10 +67,6 @@ def entries(scene):
     return sorted(content(scene)["frames"], key=lambda entry: entry["source"])
 
 
-def found_poses(scene):
-    return np.array([entry["transform_matrix"] for entry in entries(scene)])
-
-
 def test_what_is_left_out_is_named_with_its_reason_and_nothing_is_written_elsewhere(capture):
     dropped, (before, after) = capture[2].dropped, capture[3]
     assert len(before) > 2 * COUNT and after == before
@@ -83,7 +79,7 @@ def test_what_is_left_out_is_named_with_its_reason_and_nothing_is_written_elsewh
 
 def test_the_scene_is_that_of_the_truth_with_z_up(capture):
     _, folder, result, _ = capture
-    found, meta = found_poses(folder), content(folder)
+    found, meta = np.array([entry["transform_matrix"] for entry in entries(folder)]), content(folder)
     scale, off_m, off_deg = alignment(found, poses(COUNT))
     assert off_m < 0.01 and off_deg < 0.3
     assert meta["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
@@ -237,7 +233,6 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     scene, folder = written
     outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
     tracks = find_tracks(read_scene_file(folder))
-    assert tracks is not None
     np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
     np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
     assert sorted(map(len, tracks.seen.values())) == sorted(map(len, scene.model.seen))

@@ -162,7 +162,6 @@ def test_the_house_has_the_u_values_that_its_elements_were_drawn_with():
 def test_the_survey_of_the_house_is_off_by_less_than_it_says():
     stated = load_conditions(configs_folder() / "house-corner-conditions.yaml")
     wind = stated.outside.wind
-    assert wind is not None
     for one, true in ((stated.inside.air, 20.0), (stated.outside.air, 0.0), (wind, (8.0 - 5.8) / 3.8054)):
         assert one.value != true and one.low <= true <= one.high
     assert check_survey(stated).missing == () and check_survey(stated).forbidden == ()

@@ -8,12 +8,7 @@ import pytest
 from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
 
-PYTHON = sys.executable
-
-
-@pytest.fixture
-def screen() -> io.StringIO:
-    return io.StringIO()
+PYTHON = sys.executable  # Before `fake_command` replaces it
 
 
 def test_output_of_a_command_is_shown_while_it_runs_and_kept(fake_command, tmp_path):
@@ -56,24 +51,24 @@ print(peak(200_000_000), peak(600_000_000))
     assert large - small == pytest.approx(0.4, abs=0.01)
 
 
-def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path, screen):
+def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path):
     fake_command("fail", "for n in range(40): print('line', n)\nsys.exit('no space left')")
     with pytest.raises(ThermoxelsError) as caught:
-        run_command(["fail"], tmp_path / "fail.log", screen)
+        run_command(["fail"], tmp_path / "fail.log", io.StringIO())
     message = str(caught.value)
     assert message.startswith("fail: expected exit status 0, got 1.")
     assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
     assert len(message.splitlines()) < 20 and str(tmp_path / "fail.log") in message
 
 
-def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, screen, monkeypatch):
+def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, monkeypatch):
     other = tmp_path / "other"
     other.mkdir()
     (other / "ns-train").write_text("#!/bin/sh\n")
     (other / "ns-train").chmod(0o755)
     monkeypatch.setenv("PATH", str(other))
     with pytest.raises(ThermoxelsError, match=r"^ns-train: expected"):
-        run_command(["ns-train"], tmp_path / "log", screen)
+        run_command(["ns-train"], tmp_path / "log", io.StringIO())
 
 
 def test_an_interrupt_ends_the_command(fake_command, tmp_path):
@@ -97,17 +92,17 @@ def test_an_interrupt_ends_the_command(fake_command, tmp_path):
     assert not mark.exists()
 
 
-def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_path, screen, monkeypatch):
+def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_path, monkeypatch):
     monkeypatch.delattr("os.wait4")
     fake_command("work", "sys.exit(0)")
-    cost = run_command(["work"], tmp_path / "log", screen)
+    cost = run_command(["work"], tmp_path / "log", io.StringIO())
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb
 
 
-def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, screen):
+def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path):
     fake_command(
         "leave",
         "import subprocess\nsubprocess.Popen([sys.executable, '-c', 'import time; time.sleep(30)'])\nprint('done')",
     )
-    took = run_command(["leave"], tmp_path / "leave.log", screen)
+    took = run_command(["leave"], tmp_path / "leave.log", screen := io.StringIO())
     assert took.seconds < 20.0 and screen.getvalue().splitlines()[-1] == "done"

@@ -187,16 +187,6 @@ def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_traini
     assert int(typed.cameras.width[0]) == 25, "all pixels, as asked"
 
 
-def test_dataset_item(scene_folder):
-    scene = scene_folder(own_camera=True, thermal_size=(12, 10))
-    data = ThermalDataset(parse(scene.path))[1]
-    assert data["image"].shape == (18, 24, 3) and data["image"].dtype == torch.float32
-    assert data["thermal"].shape == (10, 12, 1) == data["thermal_valid"].shape
-    assert data["thermal_camera"].shape == (1,) and int(data["thermal_camera"].width) == 12
-    picture = np.asarray(Image.open(scene.path / "images" / "frame_train_001.png"))
-    np.testing.assert_array_equal(np.rint(data["image"].numpy() * 255), picture)
-
-
 def test_partner_by_path_in_another_folder(scene_folder):
     scene = scene_folder()
     (scene.path / "thermal").rename(scene.path / "infrared")
@@ -235,13 +225,8 @@ def half_in_kelvin(scene) -> None:
 
 
 def in_fahrenheit(scene) -> None:
-    (scene.path / "temperature_bounds.json").write_text(
-        '{"absolute_min_temperature": 15.0, "absolute_max_temperature": 25.0}'
-    )
-    for frame in scene.meta["frames"]:
-        name = Path(frame["file_path"]).stem
-        frame["thermal_file_path"] = f"thermal/{name}.npy"
-        np.save(scene.path / "thermal" / f"{name}.npy", np.full((18, 24), 84.0) + 0.1 * np.eye(18, 24))
+    all_in(".npy", np.full((18, 24), 84.0) + 0.1 * np.eye(18, 24))(scene)
+    write_bounds(15.0, 25.0)(scene)
 
 
 def test_kelvins_that_are_meant_are_read(scene_folder):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.support.flir_file import FlirFile, smooth_counts
+from tests.support.camera_card import FlirFile, smooth_counts
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data import layouts
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.support.colmap_model import write_colmap_model
+from tests.support.posed_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, matched_names
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -41,9 +41,7 @@ def add_model(
 
 
 def tracks_of(folder) -> SparseTracks:
-    found = find_tracks(read_scene_file(folder.path))
-    assert found is not None
-    return found
+    return find_tracks(read_scene_file(folder.path))
 
 
 def lines_of(folder, split="train", **options):

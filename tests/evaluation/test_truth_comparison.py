@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.boxed_scene import write_boxed_scene
 from tests.support.demo_mesh import demo_mesh
-from tests.support.short_training import train
+from tests.support.short_training import train, write_boxed_scene
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice, input_from_world
@@ -64,9 +63,7 @@ def compared(
     truth: KnownTruth | Path, snapshot: GridSnapshot, world_to_input: np.ndarray = IDENTITY, *mesh: Any
 ) -> dict:
     """Figures of all solid voxels, and of a mesh of them with its metres per unit."""
-    found = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, world_to_input, truth, *mesh)
-    assert found is not None
-    return found
+    return compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, world_to_input, truth, *mesh)
 
 
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
@@ -267,15 +264,10 @@ def test_surroundings_within_the_lattice_are_no_sky():
     assert depth_metrics([], narrow, IDENTITY, scene) == {}
 
 
-@pytest.fixture(scope="module")
-def pipeline(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "hot"
-    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18, thermal_width=8)
-    return train(folder, steps=0)
-
-
-def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypatch):
+def test_ns_eval_compares_the_trained_density_with_the_scene(tmp_path, monkeypatch):
     """A field that holds the exact scene, in the trained world's own coordinates, scores full."""
+    write_boxed_scene(make_scene("hot-object"), tmp_path, 8, 2, width=24, height=18, thermal_width=8)
+    pipeline = train(tmp_path, steps=0)
     averages = pipeline.get_average_eval_image_metrics()  # as in a training: without the geometry
     assert 0.0 < averages["half_transparent"] <= 1.0 and "fscore" not in averages
     outputs = pipeline.datamanager.train_dataparser_outputs

@@ -11,7 +11,7 @@ from thermoxels_ns.evaluation.truth_comparison import KnownTruth, SurfaceScore, 
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.synthetic.drawn_scenes import make_scene
 from thermoxels_ns.synthetic.scene_truth import Body
-from thermoxels_ns.synthetic.solids import Solid, Sphere
+from thermoxels_ns.synthetic.solids import BoxSolid, Solid, Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
 H = LATTICE.voxel_size
@@ -109,16 +109,7 @@ def test_fewer_than_three_cameras_see_nothing_of_any_boundary():
         assert score_of(cells, views=few)[1] == SurfaceScore()
 
 
-class Plane(Solid):
-    def __init__(self, height: float):
-        self.height = height
-
-    def signed_distance(self, points):
-        return points[:, 2] - self.height
-
-    def surface_points(self, n, seed):
-        xy = np.random.default_rng(seed).random((n, 2))
-        return np.column_stack([xy, np.full(n, self.height)]), np.tile([0.0, 0.0, 1.0], (n, 1))
+GROUND = BoxSolid([((-9.0, -9.0, -9.0), (9.0, 9.0, 0.2))])
 
 
 def slab(mesh_of_cells) -> TetMesh:
@@ -131,8 +122,8 @@ def slab(mesh_of_cells) -> TetMesh:
 
 
 def test_parallel_planes_are_their_distance_apart_and_temperatures_those_of_the_closest_point(mesh_of_cells):
-    points = Plane(0.20).surface_points(500, 0)[0]
-    found = [mesh_errors(known(Plane(0.20), points, from_above()), slab(mesh_of_cells), t) for t in (0.0501, 0.0499)]
+    points = np.column_stack((np.random.default_rng(0).random((500, 2)), np.full(500, 0.2)))
+    found = [mesh_errors(known(GROUND, points, from_above()), slab(mesh_of_cells), t) for t in (0.0501, 0.0499)]
     assert found[0]["chamfer_m"] == pytest.approx(0.05, abs=1e-12)
     assert found[0]["temperature_seen_mae_c"] == pytest.approx(0.0, abs=1e-6)
     assert [one["share_of_seen_reached"] for one in found] == [1.0, 0.0]
@@ -141,7 +132,7 @@ def test_parallel_planes_are_their_distance_apart_and_temperatures_those_of_the_
 def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
     mesh = mesh_of_cells(np.ones((2, 2, 2), dtype=bool), 0.5)
     assert np.all(mesh.facet_tags == FACET_BOX)
-    found = mesh_errors(known(Plane(0.5), np.zeros((1, 3)), from_above()), mesh, 0.1)
+    found = mesh_errors(known(GROUND, np.zeros((1, 3)), from_above()), mesh, 0.1)
     assert set(found) == {"mesh_volume_m3", "mesh_area_m2"}
 
 

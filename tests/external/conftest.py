@@ -10,29 +10,22 @@ import pytest
 
 from tests.support.demo_mesh import demo_mesh
 from tests.support.heat_bodies import CONCRETE
-from tests.support.house_mesh import house_mesh
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _LONGEST_RUN_S = 300
 
 
 @pytest.fixture(scope="session", params=["house", "hot-object"])
-def solid_mesh(request: pytest.FixtureRequest) -> TetMesh:
+def solid_mesh(request: pytest.FixtureRequest, tagged_mesh: TetMesh) -> TetMesh:
     """The meshes that are handed to every program: a shaken house of voxels, and a demo scene's conforming mesh."""
-    return house_mesh() if request.param == "house" else demo_mesh("hot-object", 24)
+    return tagged_mesh if request.param == "house" else demo_mesh("hot-object", 24)
 
 
 @pytest.fixture(scope="session")
 def heat_problem(solid_mesh) -> HeatProblem:
     """Conduction in it, as concrete."""
     return HeatProblem(solid_mesh, CONCRETE)
-
-
-@pytest.fixture(scope="session")
-def ten_steps() -> TimeSteps:
-    """Ten hours, in which heat goes about as far as a wall is thick."""
-    return TimeSteps(10, 3600.0)
 
 
 @pytest.fixture(scope="session")

@@ -5,8 +5,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_matrices import HeatMatrices, assemble, backward_euler
+from tests.support.heat_bodies import CONCRETE, HeatMatrices, assemble, backward_euler
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.files.formats import write_inp
 from thermoxels_ns.mesh.tetrahedra import facet_areas

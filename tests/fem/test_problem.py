@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import CONCRETE, box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
@@ -16,7 +15,6 @@ from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, GroundContact, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.solving import Goals
-from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 REGIONS = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
 BOX = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=REGIONS)
@@ -81,6 +79,11 @@ MESHES: Refused = [
 PROBLEMS: Refused = [
     *(("up", lambda u=u: HeatProblem(BOX, CONCRETE, up=u)) for u in ((0.0, 0.0, 0.0), (1.0, 2.0))),
     ("materials", lambda: HeatProblem(BOX, {"inner": CONCRETE})),
+    *(
+        (name, lambda n=name, v=value: replace(CONCRETE, **{n: v}))
+        for name in ("conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk")
+        for value in (0.0, NAN, "1.7")
+    ),
     *(("steady heat problem", lambda e=e: acting(*e)) for e in ((), (HeatFlux(("*",), 1.0),))),
     ("steady heat problem", lambda: acting(Convection(("*",), 0.0, 20.0))),
 ]
@@ -101,14 +104,3 @@ EFFECTS: Refused = [
 def test_what_cannot_be_is_refused_by_its_name(name, make) -> None:
     with pytest.raises(HeatError, match=f"^{name}: expected"):
         make()
-
-
-def test_the_box_itself_is_accepted() -> None:
-    assert isinstance(BOX, TetMesh) and HeatSystem(body()).num_nodes == len(BOX.points_m)
-
-
-@pytest.mark.parametrize("field", ["conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk"])
-@pytest.mark.parametrize("bad", [0.0, NAN, "1.7"])
-def test_material_refuses_impossible_values(field, bad) -> None:
-    with pytest.raises(HeatError, match=field):
-        replace(CONCRETE, **{field: bad})

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from tests.support.heat_matrices import storage
-from tests.support.heat_meshes import box_mesh, mesh_from
-from tests.support.shell_mesh import shell_mesh
+from tests.support.heat_bodies import box_mesh, mesh_from, shell_mesh, storage
 from thermoxels_ns.fem.linear_tets import TET_EDGES, lumped_mass, refine_mesh, stiffness_matrix
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space, conduction
@@ -31,7 +29,6 @@ def notched() -> TetMesh:
         keep=lambda p: (p[..., 0] < 2) | (p[..., 1] < 1),
     )
     tags = mesh.boundary
-    assert tags is not None
     return replace(
         mesh,
         boundary=replace(tags, seen=tags.patch % 2 == 0),
@@ -61,7 +58,6 @@ def test_children_inherit() -> None:
     mesh = notched()
     fine = refine_mesh(mesh)
     tags, finer = mesh.boundary, fine.boundary
-    assert mesh.colour is not None and fine.colour is not None
     np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
     for name in ("patch", "seen"):
         np.testing.assert_array_equal(getattr(finer, name), np.repeat(getattr(tags, name), 4, axis=0))

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import STEEL
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, STEEL, box_mesh, planes
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space
@@ -61,9 +60,9 @@ def box() -> TetMesh:
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_heat_of_the_nodes_is_heat_of_the_patches(box, concrete, order) -> None:
+def test_heat_of_the_nodes_is_heat_of_the_patches(box, order) -> None:
     """What the equations feed to all nodes is what the report says of all patches, to round-off."""
-    system = HeatSystem(HeatProblem(box, concrete, effects=ALL), order=order)
+    system = HeatSystem(HeatProblem(box, CONCRETE, effects=ALL), order=order)
     relative = system.start_k
     heat = system.net_heat(relative, 0.0)
     flows = system.by_group(system.part_heat_w(relative, 0.0))
@@ -73,8 +72,8 @@ def test_heat_of_the_nodes_is_heat_of_the_patches(box, concrete, order) -> None:
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_the_slope_of_radiation_is_its_derivative(box, concrete, order) -> None:
-    system = HeatSystem(HeatProblem(box, concrete, effects=ALL), order=order)
+def test_the_slope_of_radiation_is_its_derivative(box, order) -> None:
+    system = HeatSystem(HeatProblem(box, CONCRETE, effects=ALL), order=order)
     relative = system.start_k
     direction = np.random.default_rng(0).uniform(-1.0, 1.0, len(relative))
     change = system.radiation_load(relative + 1e-3 * direction, 0.0) - system.radiation_load(
@@ -85,9 +84,9 @@ def test_the_slope_of_radiation_is_its_derivative(box, concrete, order) -> None:
     assert np.abs(slope).max() > 1e-3
 
 
-def test_exchange_over_the_triangles_is_exact(box, concrete) -> None:
+def test_exchange_over_the_triangles_is_exact(box) -> None:
     """integral(h T u) for linear T and u on the side x1, by hand; at the nodes it is not, but for a constant."""
-    problem = HeatProblem(box, concrete, effects=(Convection(("x1",), 6.0, 20.0),))
+    problem = HeatProblem(box, CONCRETE, effects=(Convection(("x1",), 6.0, 20.0),))
     exact = 6.0 * (0.3**2 / 2) * (0.2 + 0.2**2 / 2)
     for order, error in ((1, 0.05), (2, 1e-12)):
         system = HeatSystem(problem, order=order)
@@ -98,11 +97,11 @@ def test_exchange_over_the_triangles_is_exact(box, concrete) -> None:
         assert order == 2 or convection.nnz == np.count_nonzero(x == 0.4)
 
 
-def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box, concrete) -> None:
+def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box) -> None:
     """integral(T^4) of T = 300 + 100 y over the side x1 has degree 4, which the six points integrate."""
     start = 300.0 - 273.15 + 100.0 * box.points_m[:, 1]
     problem = HeatProblem(
-        replace(box, temperature_c=start), concrete, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),)
+        replace(box, temperature_c=start), CONCRETE, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),)
     )
     system = HeatSystem(problem, order=2)
     heat = system.by_group(system.part_heat_w(system.start_k, 0.0))[0]

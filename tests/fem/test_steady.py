@@ -4,8 +4,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from tests.support.heat_bodies import CONCRETE, STEEL
-from tests.support.heat_meshes import SIDES, box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, SIDES, STEEL, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.implicit_equation import LinearSolver
@@ -135,10 +134,6 @@ def test_the_residual_is_round_off_where_flows_cancel() -> None:
     air = Varying(lambda places, _: np.where(places.points_m[:, 1] > 0.02, 30.0, -10.0), in_time=False)
     through = solve_steady(sheet(1e-3, Convection(("x0",), 8.0, air)))
     assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
-
-
-def laplacian(n: int) -> sparse.csr_matrix:
-    return sparse.diags([-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], [-1, 0, 1], format="csr")
 
 
 def weighted_graph(n: int = 400, seed: int = 0) -> sparse.csr_matrix:

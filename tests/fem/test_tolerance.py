@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE, STEEL, finer, nafems_t3
-from tests.support.heat_meshes import box_mesh, graded
-from tests.support.obtuse_bodies import dressed
-from tests.support.shell_mesh import shell_mesh
-from tests.support.stuffed_shapes import SHAPES, tet_mesh
+from tests.support.heat_bodies import CONCRETE, STEEL, box_mesh, finer, graded, nafems_t3, shell_mesh
+from tests.support.stuffed_shapes import SHAPES, dressed, tet_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import tolerance
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Varying

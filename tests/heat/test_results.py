@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import pyvista
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import CONCRETE, box_mesh, planes
 from thermoxels_ns.commands.heat import remove_heat_series, write_heat_series
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
@@ -151,8 +150,8 @@ def test_an_insulated_body_has_results() -> None:
     assert results.regions[0].mean_c == pytest.approx(5.0)
 
 
-def test_a_series_reads_back_and_only_it_is_removed(tmp_path, random_body, concrete) -> None:
-    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(3, 20.0))
+def test_a_series_reads_back_and_only_it_is_removed(tmp_path, random_body) -> None:
+    solution = solve_heat(HeatProblem(random_body, CONCRETE), TimeSteps(3, 20.0))
     for states in ([0, 1, 2, 3], [0, 1, 3]):  # the second one is shorter
         write_heat_series(tmp_path / "heat.pvd", random_body, solution, states)
     names = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())

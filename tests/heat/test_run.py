@@ -3,9 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, mesh_from, planes
-from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
+from tests.support.heat_bodies import CONCRETE, Z_UP, box_mesh, mesh_from, planes, room, tagged_body, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux

@@ -4,23 +4,15 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from tests.support.scene_bodies import room, wall
+from tests.support.heat_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import TimeSteps, Varying, values_at
+from thermoxels_ns.fem.problem import TimeSteps, values_at
 from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import material, material_table
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import (
-    Ground,
-    InsideAir,
-    OutsideAir,
-    Sky,
-    Sun,
-    Surface,
-    radiative_coefficient,
-)
+from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
 from thermoxels_ns.heat.sky import swinbank_sky_c
 
 ALL = {"*": material("concrete")}
@@ -45,12 +37,6 @@ def test_a_mesh_without_temperatures_starts_from_those_of_the_scene() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_what_is_not_named_is_not_built() -> None:
-    assert effects() == ()
-    (alone,) = effects(outside_air=OUTSIDE)
-    assert alone == Convection(("exterior-*",), 25.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("air", "h"),
     [
@@ -64,7 +50,6 @@ def test_what_is_not_named_is_not_built() -> None:
 )
 def test_outside_air(air: OutsideAir, h: float) -> None:
     (effect,) = effects(outside_air=air)
-    assert isinstance(effect, Convection)
     assert effect.coefficient_w_m2k == pytest.approx(h, rel=1e-4)
 
 
@@ -109,7 +94,6 @@ def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
 )
 def test_sky_alone(sky: Sky, sky_c: float) -> None:
     _, radiation = effects(outside_air=CONVECTION, sky=sky, surfaces=(Surface(emissivity=0.9),))
-    assert isinstance(radiation, Radiation)
     assert radiation.surroundings_c == sky_c
 
 
@@ -226,7 +210,6 @@ def test_start_and_up() -> None:
     mesh = room()
     scene = HeatScene(ALL, adiabatic=("*",))
     np.testing.assert_array_equal(scene.problem(mesh).start_c, mesh.temperature_c)
-    np.testing.assert_array_equal(replace(scene, initial_c=3).problem(mesh).start_c, np.full(len(mesh.points_m), 3.0))
     assert scene.problem(mesh).up == (0.0, 0.0, 1.0)
     assert scene.problem(mesh, up=(0.0, 2.0, 0.0)).up == (0.0, 1.0, 0.0)
     assert replace(scene, up=(3.0, 0.0, 0.0)).problem(mesh, up=(0.0, 1.0, 0.0)).up == (1.0, 0.0, 0.0)
@@ -245,13 +228,11 @@ PLACE = {"latitude_deg": 47.0, "longitude_deg": 8.0, "north": (0.0, 1.0, 0.0)}
         (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches"),
         (lambda: InsideAir(-300.0, "iso-6946-combined"), "air_c"),
         (lambda: InsideAir(float("nan"), "iso-6946-combined"), "air_c"),
-        (lambda: InsideAir(True, "iso-6946-combined"), "air_c"),
         (lambda: Surface(), "expected emissivity, absorptivity"),
         (lambda: Surface(emissivity=1.5), "emissivity"),
         (lambda: Sky(below_air_k=-6.0), "below_air_k"),
         (lambda: Sun(start=NOON, clear_sky="meinel"), "start"),
         (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2"),
-        (lambda: Sun(start=NOON.replace(tzinfo=None), **PLACE, clear_sky="meinel"), "start"),
         (lambda: Sun(start=NOON, **{**PLACE, "north": (0.0, 0.0, 0.0)}, clear_sky="meinel"), "north"),
         (lambda: Sun(towards=(0.0, 0.0, 1.0), latitude_deg=47.0, direct_w_m2=800.0), "latitude_deg"),
     ],
@@ -261,17 +242,10 @@ def test_sections_say_what_is_wrong(make, named: str) -> None:
         make()
 
 
-@pytest.mark.parametrize(("mean_c", "published"), [(-10.0, 4.13), (10.0, 5.15), (30.0, 6.32)])
-def test_radiation_made_linear(mean_c: float, published: float) -> None:
-    assert round(radiative_coefficient(mean_c, 1.0), 2) == published
-    assert radiative_coefficient(mean_c, 0.5) == 0.5 * radiative_coefficient(mean_c, 1.0)
-
-
 def test_horizontal_reaches_to_30_degrees() -> None:
     angle = np.radians([-31, -30, -29, 29, 30, 31])
     normals = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
     coefficient = InsideAir(20.0, "iso-6946-convection", heat_flow="out-of-body").convection().coefficient_w_m2k
-    assert isinstance(coefficient, Varying)
     found = coefficient.function(Places(np.zeros((6, 3)), normals, (0.0, 0.0, 1.0)), 0.0)
     assert np.asarray(found).tolist() == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
 
@@ -288,22 +262,8 @@ def test_every_row_is_a_material_with_a_source() -> None:
         low, high = (10.0, 400.0) if name in metals else (0.02, 0.08) if row.density_kg_m3 <= 250.0 else (0.05, 4.0)
         assert low <= row.conductivity_w_mk <= high, name
     assert all(100 < row.specific_heat_j_kgk < 2000 for row in table.values())
-
-
-@pytest.mark.parametrize(
-    ("name", "figures"),
-    [
-        ("concrete", (1.7, 2200.0, 880.0)),
-        ("aluminium", (160.0, 2800.0, 880.0)),
-        ("softwood", (0.13, 500.0, 1600.0)),
-        ("mineral-wool", (0.035, 20.0, 1030.0)),
-    ],
-)
-def test_published_rows(name: str, figures: tuple[float, float, float]) -> None:
-    found = material(name)
-    assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures
-
-
-def test_an_unknown_material_lists_the_known_and_suggests_one() -> None:
-    with pytest.raises(HeatError, match=r"^material: .* Did you mean concrete"):
-        material("concret")
+    published = {"concrete": (1.7, 2200.0, 880.0), "aluminium": (160.0, 2800.0, 880.0)}
+    published |= {"softwood": (0.13, 500.0, 1600.0), "mineral-wool": (0.035, 20.0, 1030.0)}
+    for name, figures in published.items():
+        found = table[name]
+        assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures

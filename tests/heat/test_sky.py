@@ -16,7 +16,6 @@ from thermoxels_ns.heat.sky import (
     meinel_clear_sky,
     outdoor_radiation,
     sun_position,
-    swinbank_sky_c,
     towards_sun,
 )
 
@@ -110,11 +109,6 @@ def test_a_sun_that_moves() -> None:
     # Given light shines as long as the sun is up: a wall sees half of the sky.
     assert np.asarray(given.function(walls, 43200.0)).tolist() == [50.0, 50.0]
     assert np.asarray(given.function(walls, 0.0)).tolist() == [0.0, 0.0]
-
-
-def test_swinbank_at_300_kelvin() -> None:
-    """0.0552 * 300^1.5 = 286.83 K: 13 K below the air."""
-    assert swinbank_sky_c(26.85) == pytest.approx(13.68, abs=0.01)
 
 
 def loss_w_m2(surface_k: float, places: Places, **temperatures: float) -> np.ndarray:

@@ -6,21 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import SIDES, box_mesh, planes
-from tests.support.obtuse_bodies import body
+from tests.support.heat_bodies import CONCRETE, SIDES, box_mesh, planes
+from tests.support.stuffed_shapes import body
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying, tabulated
 from thermoxels_ns.fem.solution import SteadySolution, mean_flows_w
 from thermoxels_ns.fem.tolerance import LEAVE_OUT_BELOW
 from thermoxels_ns.heat import solving as heat_solving
-from thermoxels_ns.heat.effects import (
-    AbsorbedSolar,
-    Convection,
-    FixedTemperature,
-    HeatFlux,
-    InternalHeat,
-    Radiation,
-)
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene_fields import Sun
 from thermoxels_ns.heat.solving import Goals, solve_problem

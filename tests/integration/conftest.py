@@ -7,7 +7,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run, run_forked
-from tests.support.boxed_scene import write_boxed_scene
+from tests.support.short_training import write_boxed_scene
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 

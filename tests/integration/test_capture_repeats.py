@@ -63,7 +63,6 @@ def kill_after(words: str, arguments: list[str]) -> None:
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
     ) as process:
-        assert process.stdout is not None
         seen = []
         for line in process.stdout:
             seen.append(line)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.integration.commands import SHORT_TRAINING, Trained, fail, run, started, succeed
 from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
-from tests.support.scene_bodies import room
+from tests.support.heat_bodies import room
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 

@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.boxed_scene import write_boxed_scene
 from tests.support.plane_photographs import EYES, SIZE, photographs
-from tests.support.short_training import train
+from tests.support.short_training import train, write_boxed_scene
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.multiview.evidence import evidence_of_photographs
-from thermoxels_ns.multiview.stereo import (
-    ERROR_PLANES,
-    Depths,
-    feature_rays_to_depths,
-)
+from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths, feature_rays_to_depths
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss
@@ -28,11 +23,6 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "pipes"
     write_boxed_scene(make_scene("pipes"), folder, 18, 2, width=160, height=120)
     return folder
-
-
-@pytest.fixture(scope="module")
-def untrained(scene):
-    return train(scene, 0, {})
 
 
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
@@ -52,7 +42,8 @@ def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
         assert error == pytest.approx(ERROR_PLANES * 0.02 * slope, rel=1e-5)
 
 
-def test_most_lines_of_a_scene_end_at_its_surface(untrained):
+def test_most_lines_of_a_scene_end_at_its_surface(scene):
+    untrained = train(scene, 0, {})
     lattice = untrained.model.grid.lattice
     found = evidence_of_photographs(untrained.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, print)
     assert found is not None and len(found.feature_rays.points) > 200

@@ -55,16 +55,9 @@ def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns=(0,) * 6) -> tuple[Photo
 
 
 def first_of(seen: Photographs, count: int) -> Photographs:
-    pixels = count * WIDTH * HEIGHT
-    return replace(
-        seen,
-        matrices=seen.matrices[:count],
-        centres=seen.centres[:count],
-        sizes=seen.sizes[:count],
-        firsts=seen.firsts[:count],
-        colours=seen.colours[:pixels],
-        thermal=seen.thermal[:pixels],
-    )
+    length = dict.fromkeys(("colours", "thermal"), count * WIDTH * HEIGHT)
+    length |= dict.fromkeys(("matrices", "centres", "sizes", "firsts"), count)
+    return replace(seen, **{name: getattr(seen, name)[:some] for name, some in length.items()})
 
 
 def found(seen: Photographs) -> np.ndarray:

@@ -13,13 +13,7 @@ from thermoxels_ns.mesh.tetrahedra import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
-from thermoxels_ns.multiview.votes import (
-    FEWEST_POINTS,
-    air_voxels,
-    hardly_shown,
-    supporting_photographs,
-    votes,
-)
+from thermoxels_ns.multiview.votes import FEWEST_POINTS, air_voxels, hardly_shown, supporting_photographs, votes
 from thermoxels_ns.synthetic.scene_truth import look_at
 from thermoxels_ns.synthetic.solids import BoxSolid
 

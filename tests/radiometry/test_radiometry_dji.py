@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.flir_file import dji_jpeg, segment
+from tests.support.camera_card import dji_jpeg, segment
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions

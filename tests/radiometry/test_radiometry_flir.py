@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
+from tests.support.camera_card import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions

@@ -10,19 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.camera_card import counts, photograph
-from tests.support.flir_file import FlirFile, dji_jpeg, picture_bytes, segment, smooth_counts
+from tests.support.camera_card import FlirFile, counts, dji_jpeg, photograph, picture_bytes, segment, smooth_counts
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.decoders import LARGEST_SIDE
 from thermoxels_ns.radiometry.measurement_model import Conditions, RadiometryOptions, corrected_temperature_c
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
-from thermoxels_ns.radiometry.thermogram import (
-    COUNT_SCALES,
-    read_thermogram,
-    recognised_camera,
-)
+from thermoxels_ns.radiometry.thermogram import COUNT_SCALES, read_thermogram, recognised_camera
 
 WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
 
@@ -120,7 +115,6 @@ def test_pixels_that_cannot_be_under_the_settings_are_masked_and_counted(tmp_pat
         ({"celsius_offset": 0.0}, "or neither"),
         ({"celsius_per_count": 0.0, "celsius_offset": 0.0}, "other than 0"),
         ({"celsius_per_count": 0.1, "celsius_offset": 0.0, "camera": "workswell"}, "a preset or a scale"),
-        ({"emissivity": 1.5}, "emissivity"),
     ],
 )
 def test_options_that_cannot_be_are_refused_at_once(values, said):

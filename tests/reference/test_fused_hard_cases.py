@@ -1,5 +1,6 @@
-"""Cases that break naive volume rendering, for both renderers: what must hold exactly, and their agreement."""
+"""Cases that break naive volume rendering, for both renderers: what must hold exactly, and the paper's sums."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.reference.two_renderers import (
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.render import reference
 from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import sample_rays
@@ -258,3 +260,41 @@ def test_wall_one_voxel_thick_is_opaque_from_both_sides(renderer, storage, angle
         assert float(seen.accumulation.min()) > 0.99
         # It is hit where it stands: half its thickness, and the voxels that interpolation smears it over.
         assert float((seen.depth - 3.0).abs().max()) < (0.75 + np.abs(normal).sum()) * lattice.voxel_size
+
+
+def test_renders_are_the_sums_of_the_paper():
+    """Eq. 1 and 2 with all voxels kept: colour, temperature, opacity, expected distance."""
+    grid = as_double(random_grid(1, 1, "exp", density=0.0))
+    rays = in_double(random_request(grid, 12, mixed=False))
+    seen = reference.render(grid, rays, RenderOptions())
+    marched = reference.march(grid, rays, RenderOptions())
+    distances, deltas = marched.t, marched.deltas
+    assert seen.rgb is not None and int((seen.accumulation > 0.1).sum()) > 6
+    for r in range(12):
+        real = deltas[r] > 0
+        points = rays.origins[r] + distances[r][real][:, None] * rays.directions[r]
+        at, along = grid.locate(points), rays.directions[r].expand_as(points)
+        rows = torch.cat((grid.rgb_at(at, along), grid.thermal_at(at, along)), 1).tolist()
+        left, total, distance = 1.0, [0.0] * 4, 0.0
+        columns = grid.density_at(at), deltas[r][real], distances[r][real]
+        for density, delta, t, row in zip(*(column.tolist() for column in columns), rows):
+            weight = left * -math.expm1(-density * delta)
+            total = [c + weight * v for c, v in zip(total, row)]
+            distance += weight * t
+            left *= math.exp(-density * delta)
+        assert [*seen.rgb[r].tolist(), float(seen.thermal[r])] == pytest.approx(total, abs=1e-12)
+        assert float(seen.transmittance[r]) == pytest.approx(left, rel=1e-10)
+        assert float(seen.accumulation[r]) == pytest.approx(1.0 - left, abs=1e-12)
+        if left < 1.0:
+            assert float(seen.depth[r]) == pytest.approx(distance / (1.0 - left), rel=1e-9)
+
+
+@pytest.mark.parametrize("activation", ["relu", "softplus", "exp"])
+def test_activations_stay_finite_for_any_stored_value(activation):
+    grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (2, 2, 2)), sh_degree=None, activation=activation)
+    for value in (-1e30, -100.0, 0.0, 100.0, 1e30):
+        grid.density.data.fill_(value)
+        density = grid.density_at(grid.locate(torch.full((3, 3), 0.5)))
+        assert (density >= 0).all() and torch.isfinite(density).all()
+        density.sum().backward()
+        assert grid.density.grad is not None and torch.isfinite(grid.density.grad).all()

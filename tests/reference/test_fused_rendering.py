@@ -1,17 +1,20 @@
-"""The compiled renderer against its plain torch twin, over random grids."""
+"""The compiled renderer against its plain torch twin, over random grids and however rows are split."""
 
 import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 from torch.nn.functional import normalize
 
 from tests.reference.two_renderers import (
     EVERYTHING,
     as_double,
+    assert_same,
     assert_twins_agree,
     in_double,
     random_grid,
@@ -19,7 +22,10 @@ from tests.reference.two_renderers import (
     see,
 )
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import num_threads, set_num_threads
+from thermoxels_ns.render import fused
 from thermoxels_ns.render.fused import render as fused_render
+from thermoxels_ns.render.kernels import AHEAD, prefetch
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import sample_rays
 
@@ -76,18 +82,6 @@ def test_rays_that_want_only_one_stream_or_none(rgb, thermal, moves):
         assert float(reference.values["rgb"].abs().max()) == 0.0
     if thermal is False:
         assert float(reference.gradients["temperature"].abs().max()) == 0.0
-
-
-def test_a_stream_that_no_ray_wants_has_no_gradient_rows():
-    grid = random_grid(1)
-    nothing, everything = torch.zeros(40, dtype=torch.bool), torch.ones(40, dtype=torch.bool)
-    plain = random_request(grid, 40)
-    for wants, absent in (((nothing, everything), "sh"), ((everything, nothing), "temperature")):
-        for parameter in grid.parameters():
-            parameter.grad = None
-        seen = fused_render(grid, RayRequest(plain.origins, plain.directions, 0.0, None, *wants), RenderOptions())
-        (seen.rgb.sum() + seen.thermal.sum() + seen.accumulation.sum()).backward()
-        assert grid.row_parameters()[absent].grad is None and grid.density.grad is not None
 
 
 def test_gradients_hold_the_touched_rows_and_no_others():
@@ -226,3 +220,51 @@ def test_both_backends_list_the_same_samples(case):
 def test_any_pattern_has_the_reference_s_values_and_gradients(case):
     grid, request, options = case
     assert_twins_agree(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel))
+
+
+@pytest.fixture
+def three_threads():
+    before = num_threads()
+    set_num_threads(3)
+    yield
+    set_num_threads(before)
+
+
+@pytest.mark.usefixtures("three_threads")
+@pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
+@pytest.mark.parametrize("ranges", [1, 30, 400])
+def test_any_number_of_row_ranges_gives_the_reference_s_sums(monkeypatch, ranges, kept):
+    """Ranges of a few rows cut through voxels, blocks of total variation and groups of samples."""
+    monkeypatch.setattr(fused, "RANGES_PER_THREAD", ranges)
+    grid = as_double(random_grid(2, 1, "exp", kept, density=0.0))
+    request, count = in_double(random_request(grid)), len(grid.voxels)
+    blocks = {"density": (3, count), "sh": (count // 3, count // 2), "temperature": (0, 1)}
+    options = replace(EVERYTHING, variation=blocks)
+    reference = see("reference", grid, request, options)
+    assert_same(see("fused", grid, request, options), reference, 1e-11, 1e-11)
+    assert all(float(g.norm()) > 0 for g in reference.gradients.values())
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch):
+    """Fewer places than samples at first: the render is repeated with room for all, and nothing is lost."""
+    grid = random_grid(1, density=-3.0)
+    request = random_request(grid, 500)
+    expected = see("fused", grid, request)
+    for room in (1, AHEAD):
+        monkeypatch.setitem(fused._room, len(grid.density), room)
+        found = see("fused", grid, request)
+        assert fused._room[len(grid.density)] > room
+        assert all(torch.equal(found.gradients[name], value) for name, value in expected.gradients.items())
+        assert all(torch.equal(found.values[name], value) for name, value in expected.values.items())
+
+
+def test_hint_is_compiled_in():
+    """A hint that does nothing at all would pass every other test."""
+
+    @njit
+    def hint(values, row):
+        prefetch(values, row, 1)
+
+    hint(np.zeros((4, 2), np.float32), 10**6)  # reads nothing
+    assert "call void @llvm.prefetch" in "".join(hint.inspect_llvm().values())

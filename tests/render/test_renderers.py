@@ -19,7 +19,6 @@ def scene() -> Scene:
     made = Scene(random_grid(1, density=-2.0), around, SphereImage(4), SkyTemperature())
     generator = torch.Generator().manual_seed(1)
     for values, scale in ((around.grid.density, 1.0), (around.grid.sh, 3.0), (around.grid.temperature, 1.0)):
-        assert values is not None
         values.data += scale * torch.randn(values.shape, generator=generator)
     for module in (made.rgb, made.thermal):
         for values in module.parameters():
@@ -38,7 +37,6 @@ def test_what_is_seen_is_what_each_part_lets_through_to_the_next():
     made, rays = scene(), request()
     whole = render_scene(made, rays, RenderOptions(), "fused")
     box, around = whole.box, whole.around
-    assert whole.rgb is not None and box.rgb is not None and around is not None and around.rgb is not None
     left = box.transmittance[:, None]
     for seen, parts, infinity, wants in (
         (whole.rgb, (box.rgb, around.rgb), made.rgb, rays.rgb_rays),
@@ -58,7 +56,6 @@ def test_the_renderers_agree_in_values_and_gradients(moves):
     for backend in ("fused", "reference"):
         made = scene()
         seen = render_scene(made, request(), options, backend, {"density": (0, 9)})
-        assert seen.rgb is not None and seen.around is not None
         loss = seen.rgb.square().sum() + seen.thermal.sum() + seen.around.transmittance.square().sum()
         (loss + seen.around.variation["density"]).backward()
         parts = [made.grid, made.surroundings.grid, made.rgb, made.thermal]
@@ -81,7 +78,6 @@ def test_rays_of_several_requests_see_together_what_they_see_alone():
     together = split_render(requests, lambda joined: render_scene(made, joined, options, "fused"))
     for part, one in zip(together, requests, strict=True):
         alone = render_scene(made, one, options, "fused")
-        assert alone.around is not None and part.around is not None
         for here, there in ((part, alone), (part.box, alone.box), (part.around, alone.around)):
             for name, value in vars(there).items():
                 if isinstance(value, torch.Tensor):
@@ -93,7 +89,6 @@ def test_rays_that_end_in_the_box_are_not_followed_out_of_it():
     made.grid.density.data.fill_(raw_density(1e3, "exp"))
     rays = replace(request(), origins=torch.zeros(60, 3), rgb_rays=None, thermal_rays=None)
     seen = render_scene(made, rays, RenderOptions(), "fused").around
-    assert seen is not None and seen.rgb is not None
     assert bool((seen.transmittance == 1.0).all()) and not bool(seen.rgb.any())
 
 
@@ -109,6 +104,5 @@ def test_a_thing_outside_is_seen_where_it_is_from_two_places():
     towards = torch.nn.functional.normalize(thing - eyes, dim=-1)
     both = RayRequest(eyes.repeat(2, 1), torch.cat((towards, towards.flip(0))))
     seen = render_scene(Scene(grid, made), both, RenderOptions(), "fused").around
-    assert seen is not None
     assert bool((seen.transmittance[:2] < 1e-3).all()), "both look at it"
     assert bool((seen.transmittance[2:] > 0.99).all()), "the other's direction leads past it"

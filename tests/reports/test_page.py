@@ -1,10 +1,8 @@
 import re
 from html.parser import HTMLParser
 from io import BytesIO
-from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from thermoxels_ns.audit.draws import Interval
@@ -86,9 +84,8 @@ MET = Target("PSNR", 27.0, 26.0, True, "{:.2f} dB", "")
 MISSED = Target("Error", 1.2, 1.0, False, "{:.2f} °C", "In K.")
 
 
-@pytest.fixture
-def shown() -> dict[str, Any]:
-    return {
+def test_results_times_and_commands_are_shown() -> None:
+    shown = {
         "photographs": 42,
         "targets": (MET, MISSED),
         "compared": (Compared("door", "W/(m2 K)", 3.6, Interval(4.0, 3.7, 4.2)), Compared("psi", "W/(m K)", 0.7, None)),
@@ -104,9 +101,6 @@ def shown() -> dict[str, Any]:
         "config": "run/config.yml",
         "exported": "export/mesh.vtu",
     }
-
-
-def test_results_times_and_commands_are_shown(shown) -> None:
     text = build_page("demo.html.j2", **shown)
     outline = Outline(text)
     for row in (

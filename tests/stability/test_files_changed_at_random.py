@@ -19,8 +19,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
-from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import CONCRETE, box_mesh
 from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.commands.audit import Audit, answers_of

@@ -4,10 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import make_body
-from tests.support.heat_matrices import assemble
-from tests.support.heat_meshes import box_mesh
-from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, H, body, faults, spots
+from tests.support.heat_bodies import assemble, box_mesh, make_body
+from tests.support.stuffed_shapes import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, H, body, faults, spots
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.steady import solve_steady

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import MOST_UNBALANCED
@@ -76,12 +76,6 @@ def layers(
     width = sides[0] / count
     regions = {n: lambda p, i=i: (p[..., 0] > i * width) & (p[..., 0] < (i + 1) * width) for i, n in enumerate(names)}
     mesh = box_mesh(ends, np.linspace(0, sides[1], 3), np.linspace(0, sides[2], 3), regions=regions)
-    # `box_mesh` finds sides to 1e-12 m.
-    across = np.abs(mesh.points_m[mesh.facets][..., 0] - mesh.points_m[mesh.facets][:, :1, 0]).max(axis=1) == 0.0
-    middle, tags = mesh.points_m[mesh.facets][..., 0].mean(axis=1), mesh.boundary
-    assert tags is not None
-    patch = np.where(across, np.where(middle < 0.5 * sides[0], 0, 1), 2)
-    mesh = replace(mesh, boundary=replace(tags, patch=patch))
     spread = rng.uniform(1.0, 12.0) if "contrast" in hostile else 0.7
     materials = {n: Material(n, power(rng, -spread, spread), 1000.0, 1000.0) for n in names}
     return mesh, mesh.points_m[:, 0].copy(), materials, float(sides[1] * sides[2])

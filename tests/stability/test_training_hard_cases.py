@@ -5,8 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.support.boxed_scene import write_boxed_scene
-from tests.support.short_training import COURSE, STEPS, train
+from tests.support.short_training import COURSE, STEPS, train, write_boxed_scene
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene

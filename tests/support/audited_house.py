@@ -9,7 +9,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 
 from tests.support.audited_wall import Truth, photographed, radiant_c
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import box_mesh, planes
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.synthetic.appearance import Paint, SunLight, sky_rgb, sky_temperature_c

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
@@ -21,7 +21,7 @@ def building_corner(cut_up: Callable[..., npt.NDArray[np.float64]]) -> HeatProbl
 
     Args:
         cut_up: Takes the coordinates of the planes between parts along one axis, [m], all multiples of 0.05; returns
-            those of the mesh, such as `planes` or `graded` of heat_meshes with their options filled in.
+            those of the mesh, such as `planes` or `graded` of heat_bodies with their options filled in.
 
     Returns:
         Its effects are convection in the lower room, in the upper room and outside, in this order.

@@ -1,9 +1,10 @@
-"""A few training steps in this process, without nerfstudio's trainer: for laws that need a trained model.
+"""A few training steps in this process, without nerfstudio's trainer, for laws that need a trained model; and scenes.
 
 The optimisers, their schedules and the callbacks are those of the default method.
 """
 
 import io
+import json
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,22 @@ from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.yaml_records import with_overrides
+from thermoxels_ns.synthetic.scene_folder import write_scene
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
+
+
+def write_boxed_scene(scene: SyntheticScene, folder: Path, num_train: int, num_eval: int, **options: Any) -> Path:
+    """Write a scene whose json names the exact box, as somebody who knows it may, and whose photographs lose nothing.
+
+    A few tiny photographs do not show where the box ends, and what JPEG does to them drowns what a test looks at.
+    """
+    options = {"photo_format": "png", "progress": False} | options
+    write_scene(scene, folder, num_train, num_eval, **options)
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"scene_box": scene.scene_box}))
+    return folder
+
 
 STEPS, RISES = 14, 9
 COURSE = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [4], "prune_at": [6], "thin_at": [RISES]}

@@ -2,19 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.support.heat_meshes import mesh_from
-from tests.support.house_mesh import house_mesh
-from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from tests.support.heat_bodies import mesh_from
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import build_mesh
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
@@ -46,14 +47,6 @@ def box_mesh(snapshot_of) -> TetMesh:
     return replace(build_mesh(snapshot, selection, np.eye(4), "voxel").mesh, boundary=None)
 
 
-def crossed_diagonals() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Two voxels side by side, and the same with the second mirrored: diagonals on the face that they share cross."""
-    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
-    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
-    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
-    return corners.astype(float), tets, np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
-
-
 @pytest.fixture
 def mesh_of_cells() -> Callable[[npt.NDArray[np.bool_]], TetMesh]:
     """Mesh given voxels of edge 0.5 m as they are, at 20 degrees."""
@@ -67,38 +60,46 @@ def mesh_of_cells() -> Callable[[npt.NDArray[np.bool_]], TetMesh]:
     return make
 
 
-@pytest.fixture
-def random_cells() -> Callable[[int], npt.NDArray[np.bool_]]:
-    """A random carved block of voxels, at least one of them solid; odd sizes along the axes."""
-
-    def make(seed: int) -> npt.NDArray[np.bool_]:
-        random = np.random.default_rng(seed)
-        cells = random.random(tuple(random.integers(1, 7, size=3))) < random.uniform(0.15, 0.95)
-        cells[tuple(random.integers(0, cells.shape))] = True
-        return cells
-
-    return make
-
-
-@pytest.fixture
-def corner_density() -> Callable[[npt.NDArray[np.bool_]], npt.NDArray[np.float32]]:
-    """Corner density 1 on the corners of the given voxels, 0 elsewhere: those voxels have density 1 at the centre."""
-
-    def make(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-        nx, ny, nz = cells.shape
-        density = np.zeros((nx + 1, ny + 1, nz + 1), dtype=np.float32)
-        for dx, dy, dz in CORNER_OFFSETS:
-            np.maximum(
-                density[dx : dx + nx, dy : dy + ny, dz : dz + nz],
-                cells,
-                out=density[dx : dx + nx, dy : dy + ny, dz : dz + nz],
-            )
-        return density
-
-    return make
-
-
 @pytest.fixture(scope="session")
 def tagged_mesh() -> TetMesh:
-    """A small house with regions, patches and colours, some parts of them empty."""
-    return house_mesh()
+    """A small house: walls one voxel thick with a window and a door on a floor two voxels thick, nodes shaken by 12 %.
+
+    Three regions and five patches, the last of each empty; names with a space and with a letter that is not ASCII.
+    """
+    cells = np.zeros((9, 7, 7), dtype=bool)
+    cells[:, :, :2] = True
+    cells[[0, -1], :, :] = True
+    cells[:, [0, -1], :] = True
+    cells[3:6, 0, 3:5] = False
+    cells[0, 2:4, 2:5] = False
+    corners, tets = kuhn_tets(cells)
+    random = np.random.default_rng(4)
+    # Only two of the four faces of these tetrahedra are ever on a boundary: let each start at another node.
+    even = np.array([p for p in permutations(range(4)) if np.linalg.det(np.eye(4)[list(p)]) > 0])
+    tets = np.take_along_axis(tets, even[random.integers(0, len(even), len(tets))], axis=1)
+    facets = boundary_facets(tets)
+    points = (corners + random.uniform(-0.12, 0.12, corners.shape)) * 0.15 + [10.0, -3.0, 0.5]
+    assert signed_volumes(points, tets).min() > 0
+
+    normals = facet_normals(points, facets)
+    middle = corners[facets].mean(axis=1)
+    inside = np.all((middle > 0.9) & (middle < [8.1, 6.1, 7.1]), axis=1)
+    patch = np.select([normals[:, 2] > 0.8, normals[:, 2] < -0.8, inside], [0, 1, 2], default=3)
+    x, y, z = points.T
+    temperature = 18.0 + 6.0 * np.sin(3.0 * x) * np.cos(4.0 * y) + 4.0 * z + random.uniform(-0.5, 0.5, len(points))
+    return TetMesh(
+        points_m=points,
+        tets=tets,
+        temperature_c=temperature,
+        observed=random.random(len(points)) < 0.7,
+        facets=facets,
+        facet_tags=boundary_tags(facets, corners, (10, 8, 8)),
+        region=(corners[tets].mean(axis=1)[:, 2] < 2.0).astype(np.int64),
+        region_names=("walls", "floor slab", "roof"),
+        boundary=Boundary(
+            seen=middle[:, 1] < 3.0,
+            patch=patch.astype(np.int64),
+            patch_names=("up", "down", "inside", "façade 1", "cut by the box"),
+        ),
+        colour=random.random((len(points), 3)).astype(np.float32),
+    )

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.support.camera_card import counts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
@@ -92,10 +93,9 @@ def alignment(found: np.ndarray, truth: np.ndarray) -> tuple[float, float, float
     """Best similarity between two sets of poses: its scale, worst place error in true units, worst angle [degrees]."""
     a, b = found[:, :3, 3], truth[:, :3, 3]
     ac, bc = a - a.mean(axis=0), b - b.mean(axis=0)
-    left, size, right = np.linalg.svd(bc.T @ ac)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation, scale = left * sign @ right, float(size @ sign) / float((ac * ac).sum())
+    rotation = Rotation.align_vectors(bc, ac)[0].as_matrix()
+    scale = float((bc * (ac @ rotation.T)).sum() / (ac * ac).sum())
     off = np.linalg.norm(bc - scale * ac @ rotation.T, axis=1).max()
     turned = np.einsum("nji,njk->nik", rotation @ found[:, :3, :3], truth[:, :3, :3])
-    angle = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1))).max()
+    angle = np.degrees(Rotation.from_matrix(turned).magnitude()).max()
     return scale, float(off), float(angle)

@@ -21,11 +21,6 @@ ROOM = "living-room"  # cameras stand in it
 AROUND = (*(name for name in DEVELOPMENT_NAMES if name != ROOM), "house-corner+street", "hot-object+room")
 
 
-@pytest.fixture(params=SCENE_NAMES)
-def scene(request: pytest.FixtureRequest):
-    return make_scene(request.param)
-
-
 @pytest.mark.parametrize("name", (*SCENE_NAMES, *RANDOM))
 def test_solid_lies_in_the_scene_box_with_room_for_two_voxels(name: str) -> None:
     scene = make_scene(name)
@@ -130,7 +125,9 @@ def test_what_is_seen_of_surroundings_or_from_within_a_room_keeps_the_bounds_of_
 
 
 @pytest.mark.parametrize(("num_train", "num_eval"), [(42, 6), (1, 1), (2, 3), (7, 0), (4, 9)])
-def test_no_evaluation_view_repeats_a_view(scene, num_train: int, num_eval: int) -> None:
+@pytest.mark.parametrize("name", SCENE_NAMES)
+def test_no_evaluation_view_repeats_a_view(name: str, num_train: int, num_eval: int) -> None:
+    scene = make_scene(name)
     train, held_out = scene.poses(num_train, num_eval)
     assert train.shape == (num_train, 4, 4) and held_out.shape == (num_eval, 4, 4)
     positions = np.concatenate([train, held_out])[:, :3, 3]

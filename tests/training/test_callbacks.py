@@ -154,7 +154,6 @@ def test_optimisers_follow_the_schedule():
 @pytest.mark.parametrize("there", [True, False])
 def test_surroundings_are_split_where_rays_see_some_and_dropped_where_infinity_explains_all(there):
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
-    assert model.surroundings is not None
     grid, sizes = model.surroundings.grid, []
     for step in steps_of(model, attributes(model, 10), 6):
         if there and step == 0:

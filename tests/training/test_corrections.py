@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tests.support.short_training import Training, train
 from thermoxels_ns.nerfstudio_bridge import compare_with_truth
@@ -63,17 +62,11 @@ def test_nothing_is_corrected_in_a_clean_scene(tmp_path):
         np.testing.assert_array_equal(own[name].numpy(), other[name].numpy(), err_msg=name)
 
 
-@pytest.fixture(scope="module")
-def grey_sky(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "house"
-    write_scene(make_scene("house-corner+sky=0.55,0.57,0.60"), folder, 20, 1, width=128, height=96, progress=False)
-    path = folder / "transforms.json"
+def test_a_grey_sky_does_not_become_a_grey_cloud(tmp_path):
+    """Without what photographs say about it, every image fits, most of the surface is cloud, and F is below 0.6."""
+    write_scene(make_scene("house-corner+sky=0.55,0.57,0.60"), tmp_path, 20, 1, width=128, height=96, progress=False)
+    path = tmp_path / "transforms.json"
     wide = {"scene_box": [[-6.7, -8.0, -5.3], [7.7, 6.4, 9.1]]}
     path.write_text(json.dumps(json.loads(path.read_text()) | wide))
-    return folder
-
-
-def test_a_grey_sky_does_not_become_a_grey_cloud(grey_sky):
-    """Without what photographs say about it, every image fits, most of the surface is cloud, and F is below 0.6."""
     course = {"resolutions": [16, 32], "refine_at": [120], "prune_at": [220], "photo_depth": "on"}
-    assert compare_with_truth(train(grey_sky, 300, course, rays=1024))["fscore"] > 0.95
+    assert compare_with_truth(train(tmp_path, 300, course, rays=1024))["fscore"] > 0.95

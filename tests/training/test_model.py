@@ -117,7 +117,7 @@ def test_a_stream_renders_only_what_it_needs(stream, absent, backend):
     assert f"{other}_loss" not in terms and len(terms) >= 2
     sum(terms.values()).backward()
     gradient = model.grid.row_parameters()[absent].grad
-    assert gradient is None or float(gradient.to_dense().abs().max()) == 0.0
+    assert gradient is None or (backend == "reference" and float(gradient.to_dense().abs().max()) == 0.0)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.support.boxed_scene import write_boxed_scene
-from tests.support.short_training import COURSE, RISES, STEPS, Training
+from tests.support.short_training import COURSE, RISES, STEPS, Training, write_boxed_scene
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.synthetic.scene_folder import make_scene

@@ -8,7 +8,7 @@ import yaml
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils import writer
 
-from tests.support.boxed_scene import write_boxed_scene
+from tests.support.short_training import write_boxed_scene
 from tests.support.unreadable import files_end_after
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError

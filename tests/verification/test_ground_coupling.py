@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_bodies import box_mesh
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.tolerance import Goals, solve_to_tolerance

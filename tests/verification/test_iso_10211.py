@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
-from tests.support.heat_meshes import box_mesh, graded, planes
+from tests.support.heat_bodies import box_mesh, graded, planes
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
@@ -127,7 +127,6 @@ def solved_corner(cut_up, order: int, flow: float, kelvin: float) -> list[float]
     heat_w = [float(heat.heat_w[0]) for heat in solution.effects]
     assert heat_w == pytest.approx(LISTED_W, rel=flow), len(mesh.tets)
     tags = mesh.boundary
-    assert tags is not None
     for patch, listed in COLDEST_C.items():
         nodes = np.unique(mesh.facets[tags.patch == tags.patch_names.index(patch)])
         assert solution.temperature_c[nodes].min() == pytest.approx(listed, abs=kelvin), (patch, len(mesh.tets))

@@ -7,8 +7,7 @@ import pycolmap
 import pytest
 
 from tests.support.camera_card import write_pairs
-from tests.support.colmap_model import write_colmap_model
-from tests.support.posed_model import CAMERA, ring_model
+from tests.support.posed_model import CAMERA, ring_model, write_colmap_model
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.poses import MODEL_FOLDER, image_pairs, read_poses
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth

@@ -9,12 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.photograph import GpsFix
-from thermoxels_ns.capture.sfm.scale_and_up import (
-    find_up,
-    local_metres,
-    scale_from_gps,
-    scale_from_markers,
-)
+from thermoxels_ns.capture.sfm.scale_and_up import find_up, local_metres, scale_from_gps, scale_from_markers
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.synthetic.scene_truth import look_at
 

@@ -3,11 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.demo_mesh import demo_mesh
-from tests.support.flat_houses import angled_house, gable_house, house_corner
+from tests.support.demo_mesh import angled_house, demo_mesh, gable_house, house_corner
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patches import load_patch_rules, with_patches, write_patch_rules
-from thermoxels_ns.mesh.boundary.planes import Building, find_building, proposed_rules
+from thermoxels_ns.mesh.boundary.planes import find_building, proposed_rules
 from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
 UP, NORTH = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
@@ -28,11 +27,6 @@ AZIMUTH = {"north": 0.0, "north-east": 60.0, "east": 90.0, "south-east": 150.0, 
 AZIMUTH |= {"west": 270.0, "north-west": 330.0}
 
 
-@pytest.fixture(scope="module")
-def corner() -> Building:
-    return find_building(house_corner(), UP, NORTH)
-
-
 @pytest.mark.parametrize(
     ("mesh", "true", "tilt", "volume"),
     [(gable_house, GABLE, 40.0, 144.0 + 72.0 * SLOPE), (angled_house, ANGLED, 0.0, 363.0)],
@@ -50,7 +44,8 @@ def test_elements_have_the_true_areas_and_directions_and_close(mesh, true, tilt,
     assert enclosed == pytest.approx(building.volume_m3, rel=1e-6)
 
 
-def test_the_demo_house_has_its_walls_windows_and_door(corner) -> None:
+def test_the_demo_house_has_its_walls_windows_and_door() -> None:
+    corner = find_building(house_corner(), UP, NORTH)
     shown = {one.name: one for one in corner.elements if one.behind != "cover"}
     assert {name: one.flat().area for name, one in shown.items()} == pytest.approx(CORNER, rel=0.03)
     assert {name: len(shown[name].openings) for name in OPENINGS} == OPENINGS

@@ -11,14 +11,7 @@ import pyvista as pv
 
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.files import formats
-from thermoxels_ns.mesh.files.formats import (
-    BODY_GRID,
-    FACET_GRID,
-    TEMPERATURE_VIEW,
-    write_inp,
-    write_msh,
-    write_xdmf,
-)
+from thermoxels_ns.mesh.files.formats import BODY_GRID, FACET_GRID, TEMPERATURE_VIEW, write_inp, write_msh, write_xdmf
 
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
 FACE_NODES = {1: (1, 2, 3), 2: (1, 4, 2), 3: (2, 4, 3), 4: (3, 4, 1)}
@@ -34,10 +27,6 @@ def sections(path: Path) -> dict[str, list[list[str]]]:
         else:
             lines.append([field.strip() for field in line.split(",")])
     return found
-
-
-def numbers(lines: list[list[str]]) -> list[int]:
-    return [int(field) for line in lines for field in line]
 
 
 @pytest.fixture
@@ -67,7 +56,8 @@ def test_surfaces_are_the_faces_with_the_nodes_of_the_patch(written, tagged_mesh
             for element, face in written[f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT"]
         ]
         assert np.array_equal(np.sort(faces, axis=1), np.sort(facets, axis=1))
-        assert numbers(written[f"*NSET, NSET=PATCH-{name}"]) == (np.unique(facets) + 1).tolist()
+        nodes = [int(field) for line in written[f"*NSET, NSET=PATCH-{name}"] for field in line]
+        assert nodes == (np.unique(facets) + 1).tolist()
 
 
 def test_empty_parts_are_left_out(written):

@@ -3,19 +3,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import skfem
 from scipy import sparse
-from skfem.models.poisson import laplace
 
-from tests.support.heat_meshes import mesh_from
-from tests.support.small_fields import crossed_diagonals
+from tests.support.heat_bodies import mesh_from
+from tests.support.stuffed_shapes import stiffness
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_sides
-from thermoxels_ns.mesh.quality.tet_shapes import TetShapes, shapes_in_chunks
 from thermoxels_ns.mesh.temperature import tet_conductances
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
+
+
+def crossed_diagonals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two voxels side by side, and the same with the second mirrored: diagonals on the face that they share cross."""
+    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
+    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
+    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
+    return corners.astype(float), tets, np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
 
 
 def _turned_over(mesh):
@@ -103,27 +108,9 @@ def test_angles_of_voxels_are_right_in_national_coordinates_too(box_mesh, shift_
     assert figures.dihedral_range_deg == pytest.approx((45.0, 90.0), abs=1e-4)
 
 
-REGULAR = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
-ONE = np.array([[0, 1, 2, 3]])
-
-
-def shapes_of(points: np.ndarray, tets: np.ndarray = ONE) -> TetShapes:
-    return next(shapes_in_chunks(points, tets))[1]
-
-
-def test_regular_tetrahedron():
-    shapes = shapes_of(REGULAR)
-    cosines = shapes.dihedral_cosines()
-    assert cosines[:, 0] == pytest.approx([1 / 3] * 6)
-    assert shapes.six_volumes.tolist() == pytest.approx([16.0])
-    # Edge length l: each edge adds -cot(angle) l / 6 = -l / (6 sqrt 8).
-    assert shapes.stiffness()[:, 0] == pytest.approx([-np.sqrt(8) / (6 * np.sqrt(8))] * 6)
-
-
 def test_stiffness_is_that_of_scikit_fem():
     corners, tets = kuhn_tets(np.ones((3, 2, 2), dtype=bool))
     points = corners + np.random.default_rng(0).uniform(-0.2, 0.2, corners.shape)
     edges, conductances = tet_conductances(points, tets)
     ours = sparse.coo_array((-conductances, np.sort(edges, axis=1).T), shape=(len(points),) * 2).toarray()
-    theirs = laplace.assemble(skfem.Basis(skfem.MeshTet(points.T, tets.T), skfem.ElementTetP1())).toarray()
-    assert ours == pytest.approx(np.triu(theirs, 1), abs=1e-12)
+    assert ours == pytest.approx(np.triu(stiffness(points, tets).toarray(), 1), abs=1e-12)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.level_set import level_of
-from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 
 
@@ -86,13 +86,9 @@ def test_sign_range_and_type_hold_for_any_density(seed, decades, share):
     assert np.abs(level).max() <= 1.0 and np.abs(level).min() >= 0.004
 
 
-def meshed(cells: np.ndarray) -> StuffedSolid:
-    """Opaque voxels beside empty ones, as training leaves them."""
-    return sharpen(stuff(level_of(np.where(cells, 40.0, 0.0), 0.5, cells, cells)), cells.shape)
-
-
 def share_kept(cells: np.ndarray) -> float:
-    solid = meshed(cells)
+    """Of opaque voxels beside empty ones, as training leaves them."""
+    solid = sharpen(stuff(level_of(np.where(cells, 40.0, 0.0), 0.5, cells, cells)), cells.shape)
     low, high = dihedral_range_deg(solid.points, solid.tets)
     assert low >= 10.7 and high <= 164.8
     return float(signed_volumes(solid.points, solid.tets).sum() / np.count_nonzero(cells))

@@ -98,7 +98,6 @@ def test_a_few_dense_voxels_behind_a_surface_do_not_widen_the_body():
     density[:, :, 3] = 0.0
     density[2, 2, 3] = density[7, 7, 3] = 2.5
     whole = field(density, MET, weight, ends)
-    assert whole.evidence is not None
     assert not select_solid(whole, SolidSelection(region="all")).cells[:, :, :5].any()
     blind = replace(whole, evidence=replace(whole.evidence, voxel_weight=np.zeros_like(whole.evidence.voxel_weight)))
     assert select_solid(blind, SolidSelection(region="all")).cells[:, :, 3].any()

@@ -150,12 +150,10 @@ def step_of(solid: SolidCells, name: str) -> SolidStep:
     return found
 
 
-def cells_along_x(values: list[float]) -> np.ndarray:
-    """Corner densities of a row of voxels whose centres have the given densities: alternate layers solve the mean."""
-    layers = [0.0]
-    for value in values:
-        layers.append(2.0 * value - layers[-1])
-    return np.broadcast_to(np.array(layers, dtype=np.float32)[:, None, None], (len(layers), 2, 2))
+def along_x(snapshot_of, *density: float) -> GridSnapshot:
+    """A row of voxels of these densities."""
+    snapshot = snapshot_of(np.ones((len(density) + 1, 2, 2)))
+    return replace(snapshot, voxel_density=np.array(density, dtype=np.float32)[:, None, None])
 
 
 @pytest.mark.parametrize("percentile", [50.0, 99.0])
@@ -177,7 +175,7 @@ def test_selection_does_not_depend_on_the_scale_of_density(snapshot_of, scale):
 
 
 def test_zero_density_is_never_solid(snapshot_of):
-    snapshot = snapshot_of(cells_along_x([0, 0, 0, 5]))
+    snapshot = along_x(snapshot_of, 0, 0, 0, 5)
     for selection in (SolidSelection(close_gaps=0, density_percentile=0.0), SolidSelection(density_threshold=0.0)):
         assert select_solid(snapshot, selection).cells[:, 0, 0].tolist() == [False, False, False, True]
 
@@ -189,11 +187,11 @@ def test_empty_names_threshold_maximum_and_remedy(snapshot_of):
         select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection(density_percentile=90.0))
 
 
-def test_floaters_go_unless_all_is_asked_for(snapshot_of, corner_density):
+def test_floaters_go_unless_all_is_asked_for(snapshot_of):
     cells = np.zeros((14, 10, 10), dtype=bool)
     cells[:10] = True
     cells[12, 3, 3] = True
-    snapshot = snapshot_of(corner_density(cells))
+    snapshot = replace(snapshot_of(np.ones((15, 11, 11))), voxel_density=cells.astype(np.float32))
     solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0))
     assert np.argwhere(solid.left_out).tolist() == [[12, 3, 3]] and np.array_equal(solid.left_out, cells & ~solid.cells)
     assert solid.within.all()
@@ -203,7 +201,7 @@ def test_floaters_go_unless_all_is_asked_for(snapshot_of, corner_density):
 
 
 def test_gaps_are_closed_and_wide_ones_are_not(snapshot_of):
-    snapshot = snapshot_of(cells_along_x([5, 0, 0, 5, 0, 0, 0, 5]))
+    snapshot = along_x(snapshot_of, 5, 0, 0, 5, 0, 0, 0, 5)
     one = select_solid(snapshot, SolidSelection(density_threshold=1.0))
     assert np.flatnonzero(one.cells).tolist() == [0, 1, 2, 3, 7] and step_of(one, "close gaps").added == 2
 

@@ -2,15 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from tests.support.stuffed_shapes import (
-    SHAPES,
-    Shape,
-    box_distance,
-    centres,
-    on_surface,
-    tet_mesh,
-    turn,
-)
+from tests.support.stuffed_shapes import SHAPES, Shape, box_distance, centres, on_surface, tet_mesh, turn
 from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
