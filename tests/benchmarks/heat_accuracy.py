@@ -29,8 +29,7 @@ import numpy as np
 import tyro
 from measuring import append_row, logarithmic_panels, save, take_turns
 
-from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE, finer, nafems_t3, planes, shell_mesh
+from tests.support.heat_bodies import CONCRETE, building_corner, finer, nafems_t3, planes, shell_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady

@@ -1,19 +1,28 @@
 """Units, measured values, the lattice, snapshots on it, and the rename-when-done rule."""
 
+import multiprocessing
 import os
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import thermoxels_ns.core.feature_rays as module
 from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core import threads
 from thermoxels_ns.core.checks import remove_file, replace_when_done
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
+from thermoxels_ns.core.kernel_cache import forget_stale_kernels, kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.core.threads import run_ranges, run_tasks, set_num_threads
 from thermoxels_ns.core.units import TemperatureRange
 
 
@@ -189,3 +198,160 @@ def test_what_is_shown_well_ends_where_pixels_per_area_fall_off():
     farther = np.array([(-5.5, 0.0, 0.0), (-6.0, 0.0, 0.0)])
     assert views.shown_well(farther, 1.5 * one).tolist() == [True, False]
     assert views.shown_well(places, np.full(8, np.nan)).all()
+
+
+CAMERAS = np.random.default_rng(9).uniform(-0.6, 0.6, (6, 3)) + np.array([0.0, 0.0, 2.0])
+
+
+def seen_by_all(points: np.ndarray, uncertainty: float = 0.0) -> FeatureRays:
+    number = np.repeat(np.arange(len(points)), len(CAMERAS))
+    return FeatureRays(np.tile(CAMERAS, (len(points), 1)), number, points, np.full(len(number), uncertainty))
+
+
+def floor(count: int = 600, seed: int = 0, slope: float = 0.0) -> np.ndarray:
+    x, y = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, count))
+    return np.column_stack((x, y, slope * x))
+
+
+def moved_in_sight(points: np.ndarray, wrong: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Points at another distance from the middle of the cameras."""
+    middle = CAMERAS.mean(axis=0)
+    return np.where(wrong[:, None], middle + factors[:, None] * (points - middle), points)
+
+
+@pytest.mark.parametrize("slope, most_missed", [(0.0, 0.1), (1.0, 0.25)])
+@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize("side", ["before", "behind"])
+def test_wrong_points_before_and_behind_a_surface_are_found_and_right_ones_stay(
+    slope, most_missed, share, side
+) -> None:
+    random = np.random.default_rng(1)
+    points = floor(slope=slope)
+    wrong = random.random(len(points)) < share
+    factors = random.uniform(0.5, 0.75, len(points)) if side == "before" else random.uniform(1.3, 1.6, len(points))
+    agrees = agrees_with_neighbours(seen_by_all(moved_in_sight(points, wrong, factors)))
+    assert agrees[~wrong].mean() > 0.97
+    assert agrees[wrong].mean() < most_missed
+
+
+def test_of_two_surfaces_one_before_the_other_both_stay() -> None:
+    points = floor(2000)
+    near = points[:, 0] > 0.1
+    points[near, 2] = 0.7
+    points = points[near | (points[:, 0] < 0.0)]
+    assert agrees_with_neighbours(seen_by_all(points)).mean() > 0.99
+
+
+def test_the_same_distance_off_is_doubted_where_points_are_dense_and_not_where_they_are_sparse() -> None:
+    off = np.array([[0.0, 0.0, 0.3]])
+    dense, sparse = (np.concatenate((floor(count), off)) for count in (4000, 12))
+    assert not agrees_with_neighbours(seen_by_all(dense))[-1]
+    assert agrees_with_neighbours(seen_by_all(sparse))[-1]
+    assert agrees_with_neighbours(seen_by_all(dense, uncertainty=0.2))[-1], "what is not known better"
+
+
+def test_the_verdict_is_the_same_in_any_world_and_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(4)
+    points = floor(300)
+    wrong = random.random(300) < 0.2
+    lines = seen_by_all(moved_in_sight(points, wrong, random.uniform(0.5, 1.6, 300)))
+    whole = agrees_with_neighbours(lines)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    assert 0.05 < (~whole).mean() < 0.3
+    assert np.array_equal(agrees_with_neighbours(lines.moved(turn, np.array([5.0, -3.0, 1.0]), 250.0)), whole)
+    monkeypatch.setattr(module, "_RAYS_AT_ONCE", 37)
+    assert np.array_equal(agrees_with_neighbours(lines), whole)
+
+
+def test_points_without_lines_are_not_doubted_and_nothing_is_made_of_nothing() -> None:
+    nothing = FeatureRays(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), floor(4), np.zeros(0))
+    assert agrees_with_neighbours(nothing).tolist() == [True] * 4
+    none = FeatureRays(nothing.origins, nothing.point, np.zeros((0, 3)), nothing.uncertainty)
+    assert agrees_with_neighbours(none).shape == (0,)
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Iterator[None]:
+    before = threads._state["threads"]
+    yield
+    set_num_threads(before or None)
+
+
+@given(st.integers(1, 6), st.integers(0, 5000), st.integers(1, 300))
+@settings(max_examples=80, deadline=None, derandomize=True, database=None)
+def test_ranges_cover_everything_once_in_order(count, total, smallest):
+    set_num_threads(count)
+    ranges = run_ranges(lambda first, last: (first, last), total, smallest)
+    assert [i for first, last in ranges for i in range(first, last)] == list(range(total))
+    assert all(last > first for first, last in ranges)
+    assert all(last - first >= smallest for first, last in ranges[:-1])
+
+
+def test_work_runs_in_as_many_threads_as_were_asked_for():
+    """Each waits until all are there: fewer threads than asked for would wait in vain."""
+    set_num_threads(3)
+    together = threading.Barrier(3)
+    assert len(set(run_tasks([lambda: together.wait(20) for _ in range(3)]))) == 3
+    set_num_threads(1)
+    assert run_ranges(lambda *_: threading.current_thread(), 10_000, 1) == [threading.main_thread()]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_an_error_in_a_range_reaches_the_caller_and_the_next_call_works(count):
+    set_num_threads(count)
+
+    def work(first: int, last: int) -> int:
+        if first <= 700 < last:
+            raise ValueError("range with 700")
+        return last - first
+
+    with pytest.raises(ValueError, match="range with 700"):
+        run_ranges(work, 1000)
+    with pytest.raises(ValueError, match="range with 700"):
+        run_tasks([lambda: 1, lambda: work(700, 701)])
+    assert sum(run_ranges(work, 500)) == 500  # type: ignore[arg-type]
+
+
+def counted() -> int:
+    return sum(run_ranges(lambda first, last: last - first, 5000))  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_has_threads_of_its_own():
+    """Data loaders fork: the pool that they inherit has no living thread, and work given to it would never end."""
+    set_num_threads(3)
+    assert counted() == 5000
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        assert pool.apply_async(counted).get(30.0) == 5000
+    assert counted() == 5000
+
+
+def test_what_was_compiled_from_other_sources_goes_and_nothing_else(tmp_path: Path):
+    one, two, cached = tmp_path / "one.py", tmp_path / "two.py", tmp_path / "cache"
+    one.write_text("a = 1")
+    two.write_text("b = 1")
+    assert forget_stale_kernels(cached, (one, two))
+    kept = [cached / "one.f-3.py311.nbi", cached / "two.g-7.py311.1.nbc"]
+    for path in (*kept, cached / "one.pyc"):
+        path.write_text("x")
+    assert not forget_stale_kernels(cached, (two, one)) and all(path.exists() for path in kept)
+    one.write_text("a = 2")  # as long as before: a time stamp may be equal too
+    assert forget_stale_kernels(cached, (one, two))
+    assert not any(path.exists() for path in kept) and (cached / "one.pyc").exists()
+    assert not forget_stale_kernels(cached, (one, two))
+
+
+def test_the_kernels_in_use_are_watched():
+    from thermoxels_ns.mesh.solid.free_space import _enter_solid as in_mesh
+    from thermoxels_ns.render.kernels import march_rays as in_render
+
+    for dispatcher in (in_mesh, in_render):
+        assert (Path(dispatcher.stats.cache_path) / "thermoxels-kernels.sha256").is_file()
+
+
+def test_a_kernel_divides_like_numpy():
+    @kernel(cache=False)
+    def share(a, b):
+        return a / b
+
+    assert share(1.0, 0.0) == np.inf

@@ -5,8 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE, STEEL, box_mesh, finer, graded, nafems_t3, shell_mesh
+from tests.support.heat_bodies import CONCRETE, STEEL, box_mesh, building_corner, finer, graded, nafems_t3, shell_mesh
 from tests.support.stuffed_shapes import SHAPES, dressed, tet_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import tolerance

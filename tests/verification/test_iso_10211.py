@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
-from tests.support.heat_bodies import box_mesh, graded, planes
+from tests.support.heat_bodies import COLDEST_C, LISTED_W, box_mesh, building_corner, graded, planes
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
