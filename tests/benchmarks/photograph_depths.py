@@ -19,9 +19,8 @@ from measuring import print_head, print_row, synthetic_scene
 
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
-from thermoxels_ns.multiview.evidence import depths_of_dataset
-from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo import Depths, depths_before_backdrop
+from thermoxels_ns.multiview.photographs import Photographs, read_photographs
+from thermoxels_ns.multiview.stereo import Depths, depths_before_backdrop, depths_of
 from thermoxels_ns.synthetic.raycast import first_surface
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
@@ -43,7 +42,7 @@ class PhotographDepths:
             parsed = config.setup().get_dataparser_outputs("train")
             lo, hi = parsed.scene_box.aabb.double().numpy()
             began = time.perf_counter()
-            found = depths_of_dataset(ThermalDataset(parsed), 0.0, lo, hi)
+            found = depths_of(read_photographs(ThermalDataset(parsed)), lo, hi)
             seconds = time.perf_counter() - began
             assert found is not None
             centre = parsed.dataparser_transform.double().numpy()

@@ -28,7 +28,6 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo import depths_of
 
 UNSEEN = 0.35
 
@@ -408,8 +407,7 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path, monkeyp
     thermal = np.full(len(grey), np.nan, np.float32)
     photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey, thermal)
     lines: list[str] = []
-    depths = depths_of(photographs, ball.lattice.lo, ball.lattice.hi)
-    monkeypatch.setattr("thermoxels_ns.multiview.evidence.depths_of_dataset", lambda *_: depths)
+    monkeypatch.setattr("thermoxels_ns.multiview.photographs.read_photographs", lambda dataset: dataset)
     summary = export_scene(trained(ball, dataset=photographs), ExportOptions(), tmp_path, lines.append)
     shares = summary["mesh"]["share_of_area_by_support"]
     assert shares["supported"] == shares["weak"] == 0.0

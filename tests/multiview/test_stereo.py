@@ -42,17 +42,6 @@ def test_a_plane_is_found_where_it_is_whatever_the_brightness_of_photographs():
     assert np.nanmedian(np.abs(other.depth - TRUE_DEPTH)) < 0.006
 
 
-def test_larger_photographs_halve_the_error():
-    seen, larger = (photographs(size=size, scale=2.5) for size in (SIZE, 3 * SIZE))
-    coarse, fine = depths_of(seen, LO, HI), depths_of(seen, LO, HI, larger=larger)
-    assert np.array_equal(np.isfinite(coarse.depth), np.isfinite(fine.depth))
-    off = [np.nanmedian(np.abs(found.depth - TRUE_DEPTH)) for found in (coarse, fine)]
-    assert off[1] < 0.5 * off[0]
-    moved = np.isfinite(fine.depth) & (fine.error != coarse.error)
-    assert moved.sum() > 0.7 * np.isfinite(fine.depth).sum()
-    assert np.allclose(fine.error[moved] * 3.0, coarse.error[moved], rtol=0.5)
-
-
 def test_where_texture_fades_depths_come_from_what_lies_beside():
     """Costs are added up along paths: alone, no pixel in the middle of the stripe knows its depth."""
     seen = photographs()
@@ -79,7 +68,7 @@ def test_threads_do_not_change_a_bit():
     found = []
     for threads in (1, 3):
         set_num_threads(threads)
-        found.append(depths_of(photographs(), LO, HI, larger=photographs(size=2 * SIZE)))
+        found.append(depths(photographs()))
     set_num_threads(None)
     for name in ("depth", "error"):
         assert np.array_equal(getattr(found[0], name), getattr(found[1], name), equal_nan=True), name

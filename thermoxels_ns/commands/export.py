@@ -192,7 +192,8 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     """
     from thermoxels_ns.mesh.build import build_mesh
     from thermoxels_ns.mesh.quality.checks import check_mesh
-    from thermoxels_ns.multiview.evidence import depths_of_dataset
+    from thermoxels_ns.multiview.photographs import read_photographs
+    from thermoxels_ns.multiview.stereo import depths_of
 
     selection, rules, distance = check_options(options)
     scene_file, lattice = scene_json(run.scene_folder), run.snapshot.lattice
@@ -212,8 +213,8 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
         up, up_source = in_file, "From the scene's json."
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
     built = build_mesh(run.snapshot, selection, to_mesh, options.boundary, up=up, rules=rules, metres_per_unit=metres)
-    depths = None if run.dataset is None else depths_of_dataset(run.dataset, 0.0, lattice.lo, lattice.hi)
-    if depths is not None:
+    if run.dataset is not None:
+        depths = depths_of(read_photographs(run.dataset), lattice.lo, lattice.hi)
         built = with_support(built, depths, run, to_mesh)
     unit = "input unit" if scale is None else "m"
     return SceneMesh(built, check_mesh(built.mesh), scale, unit, to_mesh, up, up_source)

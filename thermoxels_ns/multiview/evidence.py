@@ -15,7 +15,6 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
 from thermoxels_ns.multiview.stereo import (
-    Depths,
     depths_before_backdrop,
     depths_of,
     feature_rays_to_depths,
@@ -23,7 +22,6 @@ from thermoxels_ns.multiview.stereo import (
 )
 
 LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure one; fewer may be chance
-REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
 TAIL = 0.5  # Points left out at either end of an axis for the hull on which a ceiling lies, [%]
 FEWEST_POINTS = 100  # Points in the box that such a hull needs
@@ -78,15 +76,6 @@ class PhotographEvidence:
         return rays_through(self.photographs, chosen[inside], depth, CEILING_ERROR * depth)
 
 
-def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths:
-    """Return the depths of a `ThermalDataset`'s photographs in the box from `lo` to `hi` and behind it.
-
-    Depths nearer than `near` are not considered. Lengths are in world units.
-    """
-    photographs = read_photographs(dataset, near)
-    return depths_of(photographs, lo, hi, larger=read_photographs(dataset, near, longest_side=REFINED_SIDE))
-
-
 def evidence_of_photographs(
     dataset: Any,
     near: float,
@@ -102,7 +91,7 @@ def evidence_of_photographs(
     are estimated, and corrected if they matter, where `gains` and `offsets` are True. `say` receives the findings.
     """
     began = time.perf_counter()
-    depths = depths_of_dataset(dataset, near, lo, hi)
+    depths = depths_of(read_photographs(dataset, near), lo, hi)
     photographs = depths.photographs
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     temperatures = dataset.temperature_range

@@ -17,7 +17,6 @@ from thermoxels_ns.multiview.stereo_kernels import (
     add_differences,
     aggregate,
     correlate,
-    refine_depths,
     weigh_patches,
 )
 
@@ -57,10 +56,7 @@ VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photog
 VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other photographs agree with it
 STEEPEST = 4.0  # Steepest surface, [spacings of planes per pixel]; floors seen at 65 degrees have 0.4 to 0.9
 PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
-REFINED_RADIUS, REFINED_LIKENESS = 3, 0.06
-"""`RADIUS` and `LIKENESS` of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 were tried
-on house-corner and courtyard: the median error falls from 0.34 and 0.36 % to 0.28 and 0.22 %."""
-LEAST_CORRELATION = 0.6  # With less, refinement keeps a depth, and the sweep accepts no depth on its farthest plane
+LEAST_CORRELATION = 0.6  # With less, a depth on the farthest plane is not accepted
 ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
@@ -93,12 +89,7 @@ def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray, BoolArray
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop, ceiling
 
 
-def depths_of(
-    photographs: Photographs,
-    lo: npt.ArrayLike | None = None,
-    hi: npt.ArrayLike | None = None,
-    larger: Photographs | None = None,
-) -> Depths:
+def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt.ArrayLike | None = None) -> Depths:
     """Find the depths of the pixels of photographs in a box and behind it, or, without a box, where views overlap.
 
     For each photograph, neighbouring photographs are drawn onto planes parallel to its image, one behind the other, and
@@ -115,7 +106,6 @@ def depths_of(
         photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner of the box. None: no box.
-        larger: The same photographs with more pixels, in which depths are refined; None: depths are not refined.
 
     Returns:
         Depths, NaN where not sure; all are NaN if no photograph has a neighbour.
@@ -124,7 +114,6 @@ def depths_of(
     views = [_View.of(photographs, number) for number in range(len(photographs))]
     total = len(photographs.colours)
     depth, error = (np.full(total, np.nan, np.float32) for _ in range(2))
-    neighbours: list[list[int]] = [[] for _ in views]
 
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
@@ -132,11 +121,10 @@ def depths_of(
             span = _overlap(photographs, number) if corners is None else _span(view, *corners, photographs.near)
             if span is None:
                 continue
-            neighbours[number] = _neighbours(photographs, number, *span)
-            if neighbours[number]:
+            near = [views[other] for other in _neighbours(photographs, number, *span)]
+            if near:
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.shape[0] * view.shape[1])
-                near = [views[other] for other in neighbours[number]]
                 depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
@@ -148,8 +136,6 @@ def depths_of(
         pixels = slice(first, first + view.shape[0] * view.shape[1])
         agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
         depth[pixels][~agree.ravel()] = np.nan
-    if larger is not None:
-        _refine(photographs, larger, neighbours, depth, error)
     return Depths(photographs, depth, error)
 
 
@@ -183,52 +169,6 @@ def other_views(
     return agreeing, behind
 
 
-def _refine(
-    photographs: Photographs,
-    larger: Photographs,
-    neighbours: list[list[int]],
-    depth: Float32Array,
-    error: Float32Array,
-) -> None:
-    """Refine depths (pixels,) and their errors in place by comparing `larger` photographs, see `refine_depths`."""
-    turns, shifts = larger.matrices[:, :, :3], larger.matrices[:, :, 3]
-    pictures = [_brightness(larger, number) for number in range(len(larger))]
-
-    def work(begin: int, end: int) -> None:
-        for number in range(begin, end):
-            (width, height), first = photographs.sizes[number], photographs.firsts[number]
-            pixels = slice(first, first + width * height)
-            ratio = larger.sizes[number, 0] / width
-            near = [other for other in neighbours[number] if pictures[other].shape == pictures[number].shape]
-            if ratio <= 1.0 or not near or np.isnan(depth[pixels]).all():
-                continue
-            view = _View.of(larger, number)
-            refine_depths(
-                width,
-                depth[pixels].copy(),
-                error[pixels].copy(),
-                ratio,
-                view.features,
-                pictures[number],
-                np.stack([pictures[other] for other in near]),
-                turns[near] @ view.inverse,
-                turns[near] @ view.centre + shifts[near],
-                (REFINED_RADIUS, REFINED_LIKENESS, LEAST_WEIGHT, int(np.ceil(2.0 * ratio)), LEAST_CORRELATION),
-                float(view.noise[0]),
-                depth[pixels],
-                error[pixels],
-            )
-
-    run_ranges(work, len(larger), 1)
-
-
-def _brightness(photographs: Photographs, number: int) -> Float32Array:
-    """Return the brightness of one photograph, shape (h, w), in [0, 1]; `_OUTSIDE` where masked."""
-    (width, height), first = photographs.sizes[number], photographs.firsts[number]
-    mean = photographs.colours[first : first + width * height].mean(axis=1).reshape(height, width)
-    return np.nan_to_num(mean, nan=_OUTSIDE)
-
-
 @dataclass(frozen=True, eq=False)
 class _View:
     """One photograph, prepared for the sweep."""
@@ -248,8 +188,9 @@ class _View:
         pixels = slice(photographs.firsts[number], photographs.firsts[number] + width * height)
         warm, matrix = photographs.thermal[pixels].reshape(height, width), photographs.matrices[number]
         measured = [warm] * bool(np.isfinite(warm).any())
-        channels = np.stack([_brightness(photographs, number), *(np.nan_to_num(t, nan=_OUTSIDE) for t in measured)])
-        thirds = photographs.colours[pixels].reshape(height, width, 3) / np.float32(3.0)
+        colours = photographs.colours[pixels].reshape(height, width, 3)
+        channels = np.stack([np.nan_to_num(values, nan=_OUTSIDE) for values in (colours.mean(axis=2), *measured)])
+        thirds = colours / np.float32(3.0)
         features = np.nan_to_num(np.dstack([thirds, *measured]))
         return cls(channels, features, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
 

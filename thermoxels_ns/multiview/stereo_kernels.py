@@ -1,4 +1,4 @@
-"""Compiled loops of stereo: correlation of patches, differences of pixels, costs along paths, refined depths."""
+"""Compiled loops of stereo: correlation of patches, differences of pixels, costs along paths."""
 
 from __future__ import annotations
 
@@ -19,26 +19,6 @@ def _difference(features, row, column, i, j):
 
 
 @kernel
-def _weigh(features, row, column, radius, likeness, least_weight, around, weights):
-    """Fill `weights` with those of the patch around one pixel, as in `weigh_patches`, not yet divided by their sum.
-
-    `around` is scratch space for nine numbers.
-    """
-    k = 0
-    for i in range(row - 1, row + 2):
-        for j in range(column - 1, column + 2):
-            around[k] = _difference(features, row, column, i, j)
-            k += 1
-    scale = max(likeness, np.sort(around)[5])  # number 0 is the pixel itself
-    k = 0
-    for i in range(row - radius, row + radius + 1):
-        for j in range(column - radius, column + radius + 1):
-            weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
-            weights[k] = weight if weight >= least_weight else 0.0
-            k += 1
-
-
-@kernel
 def weigh_patches(features, channels, radius, likeness, least_weight, noise, weights, means, variances):
     """Fill `weights`, `means` and `variances` of the patch around each pixel; similar pixels have large weights.
 
@@ -50,13 +30,20 @@ def weigh_patches(features, channels, radius, likeness, least_weight, noise, wei
     masked pixel (below 0), or has a variance below `noise` (c,). Means and variances are (c, h, w).
     """
     count, height, width = channels.shape
-    around, own = np.empty(9), np.empty((2 * radius + 1) ** 2)
+    side = 2 * radius + 1
+    around, own = np.empty(9), np.empty(side * side)
     weights[:] = 0.0
     means[:] = 0.0
     variances[:] = 0.0
     for row in range(radius, height - radius):
         for column in range(radius, width - radius):
-            _weigh(features, row, column, radius, likeness, least_weight, around, own)
+            for k in range(9):
+                around[k] = _difference(features, row, column, row + k // 3 - 1, column + k % 3 - 1)
+            scale = max(likeness, np.sort(around)[5])  # number 0 is the pixel itself
+            for k in range(len(own)):
+                i, j = row - radius + k // side, column - radius + k % side
+                weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+                own[k] = weight if weight >= least_weight else 0.0
             weights[:, row, column] = own / own.sum()
             for channel in range(count):
                 mean, square, hidden, k = 0.0, 0.0, False, 0
@@ -204,128 +191,3 @@ def aggregate(cost, features, small, large, edge, total):
                 for k in range(planes):
                     total[y, x, k] += here[k]
     total /= np.float32(8)
-
-
-@kernel(fastmath={"contract"})
-def refine_depths(
-    width, depth, error, ratio, features, picture, others, turns, shifts, options, noise, refined, spacing
-):
-    """Move the depths of a small photograph to where larger versions of the photographs correlate best.
-
-    For each pixel of the small photograph, a patch around its middle is taken from the larger photograph, weighted as
-    in `weigh_patches`, and laid on the plane through the depths around the pixel. The patch is tried at inverse depths
-    before and behind, at steps that move it by at most half a pixel in `others`. The new depth is at the top of the
-    parabola through the best three correlations. A depth stays where the patch has no texture, the best correlation is
-    too low, or the best is the first or last step.
-
-    Args:
-        width: Columns of the small photograph.
-        depth: Depth of the pixels of the small photograph, (pixels,), [world units]; NaN: not known.
-        error: Distance between the planes of the sweep at these depths, (pixels,), [world units].
-        ratio: Columns of the larger photograph per column of the small one.
-        features: Features of the larger photograph, (h, w, f).
-        picture: Brightness of the larger photograph, (h, w).
-        others: Brightness of the photographs to compare with, (photographs, h, w); below 0 where unknown.
-        turns: Matrices from homogeneous pixels of `picture` to those of each of `others` at infinity, (n, 3, 3).
-        shifts: Homogeneous pixels that are added per inverse depth, (n, 3).
-        options: Radius, likeness, least weight, steps before and behind, and least correlation.
-        noise: Variance of the noise of brightness.
-        refined: Receives the new depths, (pixels,); unchanged where a depth stays.
-        spacing: Receives the distance in depth that moves `others` by a pixel, (pixels,), where `refined` changes.
-    """
-    radius, likeness, least_weight, steps, least = options
-    height, columns = picture.shape
-    side, count, half = 2 * radius + 1, len(others), (len(others) + 1) // 2
-    weights, own = np.empty(side * side), np.empty(side * side)
-    around, scores, best = np.empty(9), np.empty(2 * steps + 1), np.empty(half)
-    for n in range(len(depth)):
-        if np.isnan(depth[n]):
-            continue
-        u, v = (n % width + 0.5) * ratio, (n // width + 0.5) * ratio
-        column, row = int(u), int(v)
-        if min(row, column) < radius or row >= height - radius or column >= columns - radius:
-            continue
-        inverse = 1.0 / depth[n]
-        slope_u, slope_v = 0.0, 0.0
-        for axis in range(2):
-            step = 1 if axis == 0 else width
-            if n >= step and n + step < len(depth):
-                before, behind = depth[n - step], depth[n + step]
-                if abs(before - depth[n]) <= 2.0 * error[n] and abs(behind - depth[n]) <= 2.0 * error[n]:
-                    slope = 0.5 * (1.0 / behind - 1.0 / before) / ratio
-                    slope_u, slope_v = (slope, slope_v) if axis == 0 else (slope_u, slope)
-        _weigh(features, row, column, radius, likeness, least_weight, around, weights)
-        total, mean, variance, k = 0.0, 0.0, 0.0, 0
-        for i in range(row - radius, row + radius + 1):
-            for j in range(column - radius, column + radius + 1):
-                weights[k] *= picture[i, j] >= 0.0
-                own[k] = picture[i, j]
-                total += weights[k]
-                mean += weights[k] * own[k]
-                k += 1
-        if total <= 0.0:
-            continue
-        mean /= total
-        for k in range(side * side):
-            weights[k] /= total
-            own[k] -= mean
-            variance += weights[k] * own[k] * own[k]
-        if variance < 4.0 * noise:
-            continue
-        apart = 0.0  # most pixels that the patch moves in any picture per inverse depth; inverted below
-        for o in range(count):
-            t, s = turns[o], shifts[o]
-            w = t[2, 0] * u + t[2, 1] * v + t[2, 2]
-            x, y = t[0, 0] * u + t[0, 1] * v + t[0, 2], t[1, 0] * u + t[1, 1] * v + t[1, 2]
-            far = w + inverse * s[2]
-            if far > 0.0:
-                moved = np.hypot(s[0] * w - s[2] * x, s[1] * w - s[2] * y) / (far * far)
-                apart = max(apart, moved)
-        if apart <= 0.0:
-            continue
-        apart = 1.0 / apart
-        for number in range(2 * steps + 1):
-            middle = inverse + 0.5 * (number - steps) * apart
-            best[:] = OUTSIDE
-            for o in range(count if middle > 0.0 else 0):
-                t, s = turns[o], shifts[o]
-                first, second, both, reached, k = 0.0, 0.0, 0.0, 0.0, 0
-                for i in range(-radius, radius + 1):
-                    for j in range(-radius, radius + 1):
-                        weight = weights[k]
-                        if weight > 0.0:
-                            x, y = column + j + 0.5, row + i + 0.5
-                            w = middle + slope_u * (x - u) + slope_v * (y - v)
-                            far = t[2, 0] * x + t[2, 1] * y + t[2, 2] + w * s[2]
-                            if far > 0.0:
-                                a = (t[0, 0] * x + t[0, 1] * y + t[0, 2] + w * s[0]) / far - 0.5
-                                b = (t[1, 0] * x + t[1, 1] * y + t[1, 2] + w * s[1]) / far - 0.5
-                                if a >= 0.0 and b >= 0.0 and a < others.shape[2] - 1 and b < others.shape[1] - 1:
-                                    left, top = int(a), int(b)
-                                    a, b = a - left, b - top
-                                    here = (1.0 - b) * (
-                                        (1.0 - a) * others[o, top, left] + a * others[o, top, left + 1]
-                                    ) + b * ((1.0 - a) * others[o, top + 1, left] + a * others[o, top + 1, left + 1])
-                                    if here >= 0.0:
-                                        here -= mean
-                                        first += weight * here
-                                        second += weight * here * here
-                                        both += weight * here * own[k]
-                                        reached += weight
-                        k += 1
-                if reached < 0.999:
-                    continue
-                score = both / np.sqrt((variance + noise) * (max(second - first * first, 0.0) + noise))
-                for place in range(half):
-                    if score > best[place]:
-                        best[place], score = score, best[place]
-            scores[number] = best.sum() / half
-        top = scores.argmax()
-        if scores[top] < least or top == 0 or top == 2 * steps:
-            continue
-        bend = scores[top - 1] - 2.0 * scores[top] + scores[top + 1]
-        if not bend < 0.0:
-            continue
-        place = top - steps + 0.5 * (scores[top - 1] - scores[top + 1]) / bend
-        found = 1.0 / (inverse + 0.5 * place * apart)
-        refined[n], spacing[n] = found, found * found * apart
