@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.radiometry.decoders import errors_name
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
@@ -37,7 +36,9 @@ def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, 
     These are records of nerfstudio's reader, which notices a file that is cut off; pycolmap reads such a points3D.bin
     for ever. Raises `SceneError` if a file cannot be read.
     """
-    from nerfstudio.data.utils import colmap_parsing_utils  # only needed here
+    from nerfstudio.data.utils import colmap_parsing_utils  # both slow to import, and only needed here
+
+    from thermoxels_ns.radiometry.decoders import errors_name
 
     kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     remedy = "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0."
