@@ -119,9 +119,9 @@ def _changed(scene, name: str, change, **options) -> None:
         (lambda s, f: add_model(s, names=[f"other_{n}.jpg" for n in range(6)]), "no photograph of this scene"),
         (lambda s, f: add_model(s, frames=f[:2]), "2 of 2 photographs agree"),
         (lambda s, f: add_model(s, points=POINTS + np.array([0.0, 0.0, 100.0])), "behind the photographs"),
-        (lambda s, f: _changed(s, "points3D.bin", lambda _: b""), "that can be read"),
+        (lambda s, f: _changed(s, "points3D.bin", lambda _: b""), "points3D as .bin or .txt) that can be read"),
         *(
-            (lambda s, f, name=name: _changed(s, name, lambda b: b[:-1]), "that can be read")
+            (lambda s, f, name=name: _changed(s, name, lambda b: b[:-1]), "points3D as .bin or .txt) that can be read")
             for name in ("cameras.bin", "images.bin", "points3D.bin")
         ),
     ],

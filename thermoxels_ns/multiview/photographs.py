@@ -63,16 +63,13 @@ class Photographs:
         return self.firsts[number] + place[:, 1] * self.sizes[number, 0] + place[:, 0], depth, inside
 
 
-def read_photographs(
-    dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
-) -> Photographs:
+def read_photographs(dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS) -> Photographs:
     """Read at most `most` evenly spaced photographs of a `ThermalDataset` as small pinhole pictures.
 
-    Photographs with a side longer than `longest_side` [pixels] are averaged down to this size. `near` is that of
-    `Photographs`.
+    Photographs with a side longer than `LONGEST_SIDE` are averaged down to this size. `near` is that of `Photographs`.
     """
     chosen = np.linspace(0, len(dataset) - 1, min(most, len(dataset))).round().astype(int)
-    pinholes = [_photograph(dataset, int(index), longest_side) for index in chosen]
+    pinholes = [_photograph(dataset, int(index)) for index in chosen]
     return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in chosen], near), index=chosen)
 
 
@@ -95,13 +92,13 @@ def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 
     )
 
 
-def _photograph(dataset: Any, index: int, longest_side: int) -> Pinhole:
+def _photograph(dataset: Any, index: int) -> Pinhole:
     picture, mask = dataset.get_image_uint8(index).numpy(), dataset.get_mask(index)
     camera, pose, thermal = dataset.camera(index), dataset.pose(index), None
     if dataset.thermal_cameras is None:
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         thermal = np.where(valid, warm, np.nan).astype(np.float32)
-    return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side, thermal)
+    return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, thermal=thermal)
 
 
 def thermal_at(dataset: Any, photographs: Photographs, depth: Float32Array) -> Float32Array:

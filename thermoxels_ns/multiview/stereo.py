@@ -57,7 +57,9 @@ VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other p
 STEEPEST = 4.0  # Steepest surface, [spacings of planes per pixel]; floors seen at 65 degrees have 0.4 to 0.9
 PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
 LEAST_CORRELATION = 0.6  # With less, a depth on the farthest plane is not accepted
-ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
+ERROR_PLANES = 0.1
+"""Standard error of a depth, in planes of the sweep. With 0.25, F of facade, courtyard and wild-14 was 0.014, 0.004 and
+0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
 """Value of a pixel that a photograph does not show. Interpolation between this and other pixels stays below 0."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -42,11 +43,12 @@ def errors_name(
         remedy = "Reduce the picture; or copy the file again, if it is not so large: its header is damaged."
         raise error(str(path), expected=expected, got=got, remedy=remedy) from problem
     except Exception as problem:  # decoders raise OSError, SyntaxError, KeyError, TypeError, struct.error and others
+        got = str(problem) or type(problem).__name__
         # An OSError of the operating system has a number (errno); an OSError of a decoder has none.
-        strerror = problem.strerror if isinstance(problem, OSError) else None
         if isinstance(problem, OSError) and problem.errno is not None:
-            expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
-        got = strerror or str(problem) or type(problem).__name__
+            path, got = problem.filename or path, problem.strerror or got
+            if problem.errno != errno.ENOENT:
+                expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
         raise error(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 

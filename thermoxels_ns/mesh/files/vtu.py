@@ -48,10 +48,13 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 
 def write_vtk(path: Path, data: pv.PolyData | pv.UnstructuredGrid) -> None:
     """Write polygons (.vtp) or a grid (.vtu) as ParaView and pyvista read it; raise `OutputError` on failure."""
+    from vtkmodules.vtkCommonDataModel import vtkFieldData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
     writer: Any = vtkXMLPolyDataWriter() if path.suffix == ".vtp" else vtkXMLUnstructuredGridWriter()
-    fields = data.GetFieldData()
+    fields, data = vtkFieldData(), data.copy(deep=False)
+    fields.DeepCopy(data.GetFieldData())
+    data.SetFieldData(fields)
     for array in map(fields.GetAbstractArray, range(fields.GetNumberOfArrays())):
         array.SetName(escape(array.GetName()))  # VTK writes names of arrays into its XML as they are
     with replace_when_done(path) as temporary:
