@@ -305,9 +305,11 @@ def test_damaged_results_of_an_earlier_capture_name_the_stage_to_repeat(capture,
     card, earlier, _, _ = capture
     shutil.copytree(earlier, tmp_path / "scene")
     kept = tmp_path / "scene" / ".capture" / name
-    kept.write_bytes(kept.read_bytes()[: kept.stat().st_size // 2])
-    with pytest.raises(ThermoxelsError, match=f"--from-stage {name.split('/')[0]}"):
-        capture_folder(card, tmp_path / "scene", settings(skip_bad=True))
+    half = kept.read_bytes()[: kept.stat().st_size // 2]
+    for spoil in (lambda: kept.write_bytes(half), kept.unlink):
+        spoil()
+        with pytest.raises(ThermoxelsError, match=f"--from-stage {name.split('/')[0]}"):
+            capture_folder(card, tmp_path / "scene", settings(skip_bad=True))
 
 
 def test_the_command(capture, tmp_path, capsys):

@@ -9,7 +9,6 @@ from scipy.sparse.linalg import spsolve
 from tests.support.heat_bodies import CONCRETE, SIDES, STEEL, assemble, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying, tabulated
-from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, solve_heat
@@ -101,12 +100,6 @@ def test_newton_ends_near_a_steady_state_and_after_it() -> None:
 HOUR_S = 3600.0
 TIMES_S = np.array([0.0, 100.0, 101.0, 102.0, 200.0]) * HOUR_S
 FLASH = np.array([0.0, 0.0, 500.0, 0.0, 0.0])
-
-
-def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
-    table = tabulated(np.array([10.0, 20.0, 50.0]), np.array([1.0, 3.0, 0.0]))
-    found = [table.function(Places(np.zeros((1, 3)), np.zeros((1, 3))), time_s) for time_s in (0.0, 15.0, 35.0, 99.0)]
-    assert found == [1.0, 2.0, 1.5, 0.0] and table.resolution_s == 10.0 and table.in_time
 
 
 def test_adaptive_steps_do_not_step_over_a_table() -> None:

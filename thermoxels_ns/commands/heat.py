@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from xml.etree import ElementTree
 
 import numpy as np
 import tyro
@@ -271,6 +270,8 @@ def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: 
     `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are numbers of
     kept times. An earlier series is removed first. Raises `OutputError` if writing fails.
     """
+    from xml.etree import ElementTree
+
     from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
 
     remove_heat_series(pvd)

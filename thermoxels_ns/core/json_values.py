@@ -43,7 +43,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `plain_values(content)` to a json file; raises `OutputError` if writing fails."""
+    """Write `plain_values(content)`, which may raise, to a json file; raises `OutputError` if writing fails."""
     text = json.dumps(plain_values(content, path.stem), indent=1, ensure_ascii=False, allow_nan=False)
     with replace_when_done(path) as temporary:
         # Names of files that are not UTF-8 hold surrogates, which are then written as json escapes them.

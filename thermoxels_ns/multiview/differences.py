@@ -24,8 +24,7 @@ _ROUNDS, _HUBER = 5, 2.0  # Rounds of robust least squares; a pair off by more s
 
 
 def without_gains(photographs: Photographs, log_gain: FloatArray) -> Photographs:
-    """Return the photographs with colours divided by the gains exp(`log_gain`), (photographs, 3); `measured` keeps
-    the colours as they were."""
+    """Return photographs with colours divided by the gains exp(`log_gain`), (photographs, 3); `measured` stays."""
     gain = np.exp(log_gain).astype(np.float32)[photographs.numbers]
     return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
 

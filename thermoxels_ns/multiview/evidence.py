@@ -101,7 +101,9 @@ def evidence_of_photographs(
     thermal = thermal_at(dataset, photographs, np.where(np.isnan(depths.depth), far, depths.depth))
     photographs = replace(photographs, thermal=thermal)
     log_gain = offset = None
-    found, error = photograph_differences(depths, thermal) if gains or offsets else 2 * (np.zeros((0, 4)),)
+    found = error = np.zeros((0, 4))
+    if gains or offsets:
+        found, error = photograph_differences(depths, thermal)
     if gains and matters(found[:, :3], error[:, :3], LEAST_GAIN):
         log_gain = found[:, :3]
         photographs = without_gains(photographs, log_gain)
