@@ -50,6 +50,7 @@ STAGES: Mapping[str, Needs] = {
 }
 """Stages in the order in which they follow. A stage that ran out of memory or was ended is tried once more, and then
 asks for twice the memory and time."""
+AFTER = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}  # What a stage follows
 
 
 @dataclass(frozen=True)
@@ -241,13 +242,12 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
         "heat": ["thermoxels", "heat", mesh, "--scene", building.heat, "--output-dir", str(folder / "heat")],
         "audit": [*audit, "--output-dir", str(folder / "audit")],
     }
-    after = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}
     wanted = {"scene": building.photographs, "heat": building.heat, "audit": building.conditions}
     stages = {name: command for name, command in commands.items() if wanted.get(name, "yes")}
     reads = {"mesh": building.patches, "heat": building.heat, "audit": building.conditions}
     plan = {}
     for name, command in stages.items():
-        markers = [f"{folder.as_posix()}/{after[name]}.json"] if after.get(name) in stages else []
+        markers = [f"{folder.as_posix()}/{AFTER[name]}.json"] if AFTER.get(name) in stages else []
         files = [file for file in [reads.get(name, "")] if Path(file).is_absolute()]
         plan[name] = Stage(command, markers + files)
     return plan
