@@ -58,8 +58,9 @@ STEEPEST = 4.0  # Steepest surface, [spacings of planes per pixel]; floors seen 
 PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
 LEAST_CORRELATION = 0.6  # With less, a depth on the farthest plane is not accepted
 ERROR_PLANES = 0.1
-"""Standard error of a depth, in planes of the sweep. With 0.25, F of facade, courtyard and wild-14 was 0.014, 0.004 and
-0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
+"""Error of a depth that trainings and votes reckon with, in planes of the sweep. Of single pixels 68 % are within 0.26
+to 0.29 planes (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade,
+courtyard and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
 """Value of a pixel that a photograph does not show. Interpolation between this and other pixels stays below 0."""
