@@ -70,6 +70,7 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
         OutputError: A file cannot be written.
     """
     path = Path(path)
+    mesh.check()  # before a folder is made
     writable_folder(path.parent)
     if path.suffix == ".vtu":
         write_vtk(boundary_path(path), boundary_surface(mesh))
