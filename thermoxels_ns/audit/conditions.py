@@ -286,7 +286,7 @@ class Weather:
 
 @record(AuditError)
 class Conditions:
-    """All that the user states beside the photographs."""
+    """Conditions of an audit, as the user's yaml file states them: air, surroundings, camera, surfaces, weather."""
 
     side: Side  # Side from which the surface was photographed
     inside: InsideAir

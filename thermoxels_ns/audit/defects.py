@@ -156,7 +156,7 @@ def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
 
 
 def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
-    """Return pairs of triangles that share an edge and a patch, as places in `which`, shape (p, 2)."""
+    """Return all pairs of triangles of one patch that share an edge, as indices into `which`, shape (p, 2)."""
     pairs = np.stack(group_sides(surface.mesh.facets[which]).pairs(), axis=1) // 3
     patch = surface.selection.facet_patch[which]
     return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]

@@ -27,7 +27,7 @@ _SCENE = "house-corner"  # The scene whose U-values are known
 
 @dataclass
 class Demo:
-    """Photograph a drawn house, train, evaluate, export, simulate and audit, and compare all with the exact truth."""
+    """Photograph a synthetic house, train, evaluate, export, simulate, audit, and compare all with the exact truth."""
 
     output_dir: Path = Path("demo")
     """Folder for all results; made if it does not exist. An earlier demo in the folder is replaced."""

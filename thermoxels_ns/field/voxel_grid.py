@@ -93,7 +93,7 @@ class VoxelGrid(nn.Module):
 
     @property
     def lattice(self) -> Lattice:
-        """The lattice of the corners, kept or not."""
+        """The whole lattice, with corners that no kept voxel uses."""
         return self.voxels.lattice
 
     @property

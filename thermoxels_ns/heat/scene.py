@@ -233,9 +233,9 @@ class HeatScene:
     def _of_surfaces(
         self, selection: Selection, key: Literal["emissivity", "absorptivity"], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
-        """Return, for each value of the property `key` of surfaces, the patches that have it, as patterns, and it.
+        """Group patches by their value of `key` in `surfaces`; return the escaped names of each group and its value.
 
-        The last entry for a patch holds; `allowed` None: all patches.
+        Of several entries for a patch the last one holds. `allowed` limits the patches; None: all patches.
         """
         chosen: dict[str, float] = {}
         for number, surface in enumerate(self.surfaces, start=1):

@@ -28,16 +28,16 @@ _WIDEST, _ROUNDS = 0.3, 8
 
 
 def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return which pixels show a plain backdrop, which pixels beside these look like it, and which show a ceiling.
+    """Return three masks (pixels,): the plain backdrop, pixels at its outline with wrong depths, and a plain ceiling.
 
-    All three have shape (pixels,).
+    Under a sky there is no ceiling; in a room there is nothing but a ceiling; where neither is sure, only the second.
 
     No photograph tells how far away a plain area is. A plain pixel without a known `depth` (pixels,) shows the backdrop
     if plain pixels lead up from it to the edge of the photograph (a wall ends at a roof, windows or the ground), and if
     its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
     Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
     the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
-    the sky, 0.5 % without these pixels). In a room it is a ceiling, see `what_is_above`.
+    the sky, 0.5 % without these pixels). `what_is_above` tells sky and ceiling apart.
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)

@@ -44,7 +44,7 @@ class Photographs:
         return len(self.matrices)
 
     def of_pixels(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return camera centres and directions (of depth 1) of the pixels `chosen` (n,), both (n, 3), in the world."""
+        """Return camera centres and directions to depth 1 of the pixels `chosen` (n,), both (n, 3), in the world."""
         number = np.searchsorted(self.firsts, chosen, side="right") - 1
         place, width = chosen - self.firsts[number], self.sizes[number, 0]
         pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))

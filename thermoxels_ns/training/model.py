@@ -320,7 +320,10 @@ class ThermoxelsModel(Model):
         return terms | outputs["known_rays"]
 
     def _known_rays(self) -> dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]]:
-        """Return random rays about whose ends photographs say something, and the loss of what they see, by its name."""
+        """Return random rays whose ends are known from photographs, and their loss as a function of the rendering.
+
+        Both stand by the loss's name: tracks, backdrop, bend.
+        """
         weights, near, voxel = self.loss_weights, self.config.near_plane * self.unit, self.grid.lattice.voxel_size
         known: dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]] = {}
         for name, weight, sampler in (

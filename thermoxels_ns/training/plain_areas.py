@@ -17,10 +17,10 @@ ALIKE = 0.06  # Largest difference of a channel between the middle pixel of thre
 
 
 class PlainAreas:
-    """Draws three pixels in a row or a column, equally far apart, with nothing but even pixels between them.
+    """Areas without texture, in which it draws three pixels in a row or column, equally far apart.
 
-    The middle pixel shows neither a sure depth nor a backdrop. The outer ones may lie on the rim of the plain area,
-    where depths are known.
+    All pixels between the three are without texture. The middle pixel shows neither a sure depth nor a backdrop. The
+    outer ones may lie on the rim of the plain area, where depths are known.
 
     Args:
         photographs: Pinhole photographs.

@@ -79,7 +79,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         super().set_experiment_name()
 
     def moved_to(self, folder: Path) -> None:
-        """Take `folder` as that of the run, and as its scene the one that lies to it as it did when it was trained."""
+        """Use `folder` as the run's folder, and the scene at the same place relative to it as when it was trained."""
         manager: Any = self.pipeline.datamanager
         scene = scene_of_run(folder, manager.data or manager.dataparser.data, self.scene_from_run)
         manager.dataparser.data = scene

@@ -178,13 +178,13 @@ def _place(pixels: FloatArray) -> FloatArray:
 
 
 class WindowScore:
-    """Log likelihood of a rig, up to a factor, from the windows of all frames.
+    """Score of a rig: how well brightness explains temperature in small windows of all frames.
 
     A window of about three thermal pixels mostly shows two materials. Its temperatures then are t = a + b x + c y + d p
     with p the photograph's brightness, blurred as the thermal camera blurs. R2 is the share of the temperature's
-    variance about a + b x + c y that d p explains. A window's log likelihood is -n / 2 log(1 - R2) for n independent
-    readings; the score takes n = 1 times the window's trust, because `RigPosterior` finds the factor. The gain d is
-    free in every window, so warm may be bright or dark. A window of more than two materials should be left out.
+    variance about a + b x + c y that d p explains. The log likelihood of n independent readings is -n / 2 log(1 - R2);
+    a window counts with n = its trust (`Windows.trust`), and `RigPosterior` scales the sum. The gain d is free in every
+    window, so warm may be bright or dark. A window of more than two materials should be left out.
     """
 
     def __init__(self, windows: Sequence[Windows], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:

@@ -79,7 +79,10 @@ def _count_along(
     order: tuple[int, int, int],
     sign: int,
 ) -> None:
-    """Add to `counts` what one camera sees in the pyramid around one half (`sign`) of the axis `order[0]`."""
+    """Add to `counts` what one camera has in its image and sees, in the pyramid around one half (`sign`) of an axis.
+
+    The axis is `order[0]`, that of the layers of `solid`; `counts` has both numbers of `CameraCounts`.
+    """
     distance = sign * (np.arange(len(solid)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:

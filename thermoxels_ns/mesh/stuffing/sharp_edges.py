@@ -64,7 +64,7 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 
 
 def _clear(surface: Surface, node: IntArray, to: FloatArray) -> BoolArray:
-    """Return False for outward moves towards a surface that faces the node within `_CLEARANCE`, shape (m,)."""
+    """Return which moves are allowed, (m,): an outward move is not if a surface faces the node within `_CLEARANCE`."""
     clear, start = np.ones(len(node), dtype=bool), surface.points[node]
     others = np.unique(surface.facets)
     pairs = KDTree(start).sparse_distance_matrix(KDTree(surface.points[others]), _CLEARANCE, output_type="ndarray")
