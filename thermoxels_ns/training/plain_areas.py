@@ -69,7 +69,7 @@ class PlainAreas:
 
 
 def _even_around(even: BoolArray) -> IntArray:
-    """Return how far the even pixels around each pixel of (h, w) reach to both sides in its row, and the next pixel."""
+    """Return the largest n, (h, w), for which the pixels up to n - 1 columns left and right of a pixel are all even."""
     column, last = np.arange(even.shape[1]), even.shape[1] - 1
     left = column - np.maximum.accumulate(np.where(even, -1, column), axis=1)
     right = np.minimum.accumulate(np.where(even, last + 1, column)[:, ::-1], axis=1)[:, ::-1] - column

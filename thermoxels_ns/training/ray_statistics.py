@@ -34,8 +34,10 @@ def _sampled(
 def voxel_weights(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
 ) -> tuple[Float[Tensor, " voxels"], Bool[Tensor, " voxels"]]:
-    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel: a
-    ray that ends on something (opacity above one half) completes half of its weight there."""
+    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel.
+
+    A ray that ends on something (opacity above one half) ends where half of its weight is complete.
+    """
     device = grid.density.device
     largest = torch.zeros(len(grid.voxels), device=device)
     ends = torch.zeros(len(grid.voxels), dtype=torch.bool, device=device)
