@@ -310,7 +310,7 @@ class _Fit:
         )
 
     def _combination(self, direction: FloatArray, sensitive_k: float, units: Mapping[str, str]) -> str:
-        """Return a sentence on the properties that are unknown along a direction of logarithms, shape (m,)."""
+        """Return a sentence on a combination of properties that readings do not tell: direction of logarithms (m,)."""
         share = direction / direction[np.argmax(np.abs(direction))]
         which = [n for n in np.argsort(-np.abs(share), kind="stable") if abs(share[n]) >= _SMALL_SHARE]
         named = [self.names[n] for n in which]

@@ -224,7 +224,7 @@ def _ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
 
 
 def _with_common(before: Conditions, after: Conditions, earlier: Draws) -> tuple[Draws, tuple[str, ...]]:
-    """Return draws of the later survey in which what is common errs as in `earlier`, and the names of that.
+    """Return draws of the later survey whose common quantities err as in `earlier`, and the names of these quantities.
 
     Emissivities, and the film's factor and formula, are common: whoever surveys twice uses the same ones.
     """
@@ -248,7 +248,7 @@ def _places(points_m: FloatArray, normal: FloatArray) -> FloatArray:
 
 
 def _partners(surface: AuditedSurface, at: FloatArray, other: AuditedSurface, other_at: FloatArray) -> IntArray:
-    """Return the nearest triangle of another survey that faces the same way as each of a survey, or -1, (f,).
+    """Return for each triangle of a survey the nearest one of the other that faces the same way, or -1, (f,).
 
     Both have to count; `at` and `other_at` are their `_places`.
     """
