@@ -66,25 +66,25 @@ NEVER = {
 MOST_LINES = {
     "audit": 3345,
     "capture": 3080,
-    "commands": 2490,
+    "commands": 2450,
     "core": 1860,
     "data": 2385,
     "evaluation": 385,
-    "fem": 2700,
-    "field": 885,
-    "heat": 2345,
-    "mesh": 4650,
-    "multiview": 1885,
-    "radiometry": 1240,
-    "render": 1665,
-    "reports": 1240,
+    "fem": 2635,
+    "field": 880,
+    "heat": 2255,
+    "mesh": 4605,
+    "multiview": 1740,
+    "radiometry": 1235,
+    "render": 1650,
+    "reports": 1190,
     "synthetic": 2750,
-    "training": 2715,
+    "training": 2665,
     "root": 645,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 28300
+MOST_TEST_LINES = 27570
 
 
 def room_of(module: str) -> str:
