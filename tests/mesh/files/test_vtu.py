@@ -9,7 +9,7 @@ import pyvista as pv
 from tests.support.unreadable import forbid
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.vtu import boundary_surface, read_mesh, write_vtk
+from thermoxels_ns.mesh.files.vtu import body_grid, boundary_surface, read_mesh, write_vtk
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, facet_areas, facet_normals
 
 
@@ -48,8 +48,10 @@ def test_a_tagged_mesh_comes_back_bit_for_bit(tmp_path, tagged_mesh, name) -> No
     read = read_mesh(tmp_path / name)
     assert_same(read, counted)
     assert read.colour.dtype == np.float32 and np.abs(read.colour - tagged_mesh.colour).max() <= 0.5 / 255 + 1e-7
-    again = tmp_path / "again.vtu"
+    again, grid = tmp_path / "again.vtu", body_grid(read)
     write_mesh(again, read)
+    write_vtk(again, grid)
+    assert "region:a<b>" in grid.field_data  # what is written stays as it was
     assert np.array_equal(read_mesh(again).colour, read.colour)
 
 
