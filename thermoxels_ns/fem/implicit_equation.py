@@ -296,7 +296,8 @@ class ImplicitEquation:
         conducted_w, parts_w = system.conducted_heat(now_k), system.exchange_parts(now_k, time_s)
         if np.isfinite(self._step_s):
             parts_w.append(-system.nodal_mass_j_k * change_k / self._step_s)
-        kept_w, moved_w, fixed = np.sum(parts_w, axis=0), np.sum(np.abs(parts_w), axis=0), system.fixed.nodes
+        nothing_w, fixed = np.zeros(system.num_nodes), system.fixed.nodes
+        kept_w, moved_w = sum(parts_w, nothing_w), sum(map(np.abs, parts_w), nothing_w)
         flows_w = float(np.sum(moved_w) + np.sum(np.abs(kept_w[fixed] - conducted_w[fixed])))
         if given_w is not None:
             kept_w, moved_w = kept_w + given_w, moved_w + np.abs(given_w)

@@ -9,8 +9,9 @@ from scipy import sparse
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES as SHAPE_EDGES
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.quality.tet_shapes import edge_stiffness, flatness, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 FLATTEST = 1e-6
@@ -69,18 +70,49 @@ def stiffness_matrix(points_m: FloatArray, tets: IntArray, conductivity_w_mk: Fl
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
     [[3.0, -1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 1.0]]
     """
-    num_nodes, entries = len(points_m), np.empty((len(tets), 6))
-    for which, shapes in shapes_in_chunks(points_m, tets):
-        entries[which] = (conductivity_w_mk[which] * shapes.stiffness()).T
-    first, second = (tets[:, SHAPE_EDGES[:, end]].ravel().astype(np.int32) for end in (0, 1))
-    ends = np.minimum(first, second), np.maximum(first, second)
-    upper = sparse.csr_matrix((entries.ravel(), ends), shape=(num_nodes, num_nodes))
-    upper.eliminate_zeros()
+    num_nodes, entries = len(points_m), edge_stiffness(points_m, tets)
+    entries *= conductivity_w_mk[:, None]
+    start = np.zeros(num_nodes + 1, np.int32)
+    upper = sparse.csr_matrix((*_sums_at_edges(tets, entries, start), start), shape=(num_nodes, num_nodes))
+    upper.sort_indices()
     # A constant temperature has no gradient, so each row sums to 0.
     diagonal = np.zeros(num_nodes)
     diagonal -= np.asarray(upper.sum(axis=0)).ravel()
     diagonal -= np.asarray(upper.sum(axis=1)).ravel()
     return sparse.csr_matrix(upper + upper.T.tocsr() + sparse.diags(diagonal, format="csr"))
+
+
+@kernel
+def _sums_at_edges(tets: IntArray, entries: FloatArray, start: IntArray):
+    """Return the sum of the entries, (t, 6), of each edge, and its larger node; edges with zeros alone are left out.
+
+    Edges follow the order of their smaller nodes; `start`, (n + 1,), all 0, becomes the place of each one's first edge.
+    """
+    for t in range(len(tets)):
+        for e in range(6):
+            if entries[t, e] != 0.0:
+                start[min(tets[t, SHAPE_EDGES[e, 0]], tets[t, SHAPE_EDGES[e, 1]]) + 1] += 1
+    start[:] = np.cumsum(start)
+    end, larger, sums = start[:-1].copy(), np.empty(start[-1], np.int32), np.zeros(start[-1])
+    for t in range(len(tets)):
+        for e in range(6):
+            if entries[t, e] != 0.0:
+                one, two = tets[t, SHAPE_EDGES[e, 0]], tets[t, SHAPE_EDGES[e, 1]]
+                node, other = min(one, two), max(one, two)
+                place = start[node]
+                while place < end[node] and larger[place] != other:
+                    place += 1
+                if place == end[node]:
+                    larger[place], end[node] = other, place + 1
+                sums[place] += entries[t, e]
+    count = 0
+    for node in range(len(end)):
+        first, start[node] = start[node], count
+        for place in range(first, end[node]):
+            larger[count], sums[count] = larger[place], sums[place]
+            count += 1
+    start[-1] = count
+    return sums[:count].copy(), larger[:count].copy()
 
 
 def lumped_mass(points_m: FloatArray, tets: IntArray, heat_capacity_j_m3k: FloatArray) -> FloatArray:
@@ -95,7 +127,7 @@ def lumped_mass(points_m: FloatArray, tets: IntArray, heat_capacity_j_m3k: Float
 
 def refuse_flat_tets(points_m: FloatArray, tets: IntArray) -> None:
     """Raise `HeatError` if tetrahedra of a mesh that `TetMesh.check` accepts are inverted or flat."""
-    num_flat = sum(int(np.count_nonzero(~(one.flatness > FLATTEST))) for _, one in shapes_in_chunks(points_m, tets))
+    num_flat = np.count_nonzero(~(flatness(points_m, tets) > FLATTEST))
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
         got = f"{num_flat} of {len(tets)} flat or inverted"

@@ -12,7 +12,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, edge_stiffness
 
 MIN_OBSERVED_WEIGHT = 0.5
 """Least weight of thermal rays at a measured node or corner, [fully absorbed rays]. Less weight is leakage through a
@@ -116,7 +116,4 @@ def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, Floa
     An edge is listed once for each tetrahedron around it. `extend_harmonically` is exact for temperatures linear in
     space, except at edges whose entries sum to less than 0, which happens between obtuse angles.
     """
-    conductances = np.empty((len(tets), 6))
-    for which, shapes in shapes_in_chunks(points, tets):
-        conductances[which] = -shapes.stiffness().T
-    return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()
+    return tets[:, TET_EDGES].reshape(-1, 2), -edge_stiffness(points, tets).ravel()

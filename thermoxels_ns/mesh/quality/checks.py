@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.quality.tet_shapes import dihedral_cosines, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
@@ -178,11 +178,9 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
 
 def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
     """Return the smallest and the largest angle between two faces of a tetrahedron, [degrees]."""
-    least, most = 1.0, -1.0
-    for _, shapes in shapes_in_chunks(points, tets):
-        cosines = shapes.dihedral_cosines()
-        least, most = min(least, cosines.min()), max(most, cosines.max())
-    return float(np.degrees(np.arccos(most))), float(np.degrees(np.arccos(least)))
+    cosines = dihedral_cosines(points, tets)
+    low, high = np.degrees(np.arccos([cosines.max(initial=-1.0), cosines.min(initial=1.0)])).tolist()
+    return low, high
 
 
 @dataclass(frozen=True)

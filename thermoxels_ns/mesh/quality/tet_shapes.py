@@ -1,108 +1,133 @@
-"""Shapes of tetrahedra: volumes, dihedral angles and stiffness entries."""
+"""Shapes of tetrahedra: volumes, flatness, dihedral angles and stiffness entries, all compiled."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.kernel_cache import kernel
 
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
 """Node positions of the two ends of a tetrahedron's six edges, shape (6, 2)."""
-_CHUNK = 1 << 14  # tetrahedra worked on at a time, so that their data stay in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """For each edge of `TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
 _ANGLE_ROUND_OFF = 32.0 * float(np.finfo(np.float64).eps)
 """Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
-
-
-@dataclass(frozen=True)
-class TetShapes:
-    """Sides, face normals and volumes of tetrahedra; every tetrahedron is one column of the arrays."""
-
-    sides: tuple[FloatArray, FloatArray, FloatArray]
-    """Vectors from node 0 to nodes 1, 2 and 3, each of shape (3, t), [m]."""
-    normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    """Inward normals of the faces opposite nodes 0 to 3, with twice the face's area as length, each (3, t), [m^2]."""
-    six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
-    reach: float  # largest coordinate of the mesh in magnitude, from which round-off is estimated, [m]
-
-    def dihedral_cosines(self) -> FloatArray:
-        """Return the cosines of the dihedral angles at `TET_EDGES`, (6, t); angles at a face without area are 0."""
-        lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
-        cosines = np.empty((6, len(self.six_volumes)))
-        for edge, (i, j) in enumerate(_FACE_PAIRS):
-            scale = lengths[i] * lengths[j]
-            cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
-            cosine[scale == 0.0] = 1.0
-        return np.clip(cosines, -1.0, 1.0, out=cosines)
-
-    @property
-    def flatness(self) -> FloatArray:
-        """Return the least height of each tetrahedron over its longest side along an axis, below 0 if turned over."""
-        largest = np.sqrt(np.max([_dot(normal, normal) for normal in self.normals], axis=0))
-        return np.divide(self.six_volumes, largest * self.size, out=np.zeros_like(largest), where=largest > 0.0)
-
-    @property
-    def size(self) -> FloatArray:
-        """Return the longest extent of the sides along an axis, shape (t,), [m]."""
-        return np.max([np.abs(side).max(axis=0) for side in self.sides], axis=0)
-
-    def stiffness(self) -> FloatArray:
-        """Return the stiffness entries of each tetrahedron's edges at conductivity 1, shape (6, t), [m].
-
-        For linear shape functions f the entry of edge ij is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V) (`normals` n).
-        This equals -l cot(a) / 6 with the length l of the opposite edge and the dihedral angle a there: the entry is
-        positive if a is obtuse, and 0 if a is right up to round-off of the coordinates, or if V is 0.
-        """
-        entries = np.empty((6, len(self.six_volumes)))
-        weight = np.zeros_like(self.six_volumes)
-        np.divide(1.0, 6.0 * self.six_volumes, out=weight, where=self.six_volumes != 0.0)
-        squares = [_dot(normal, normal) for normal in self.normals]
-        right = _ANGLE_ROUND_OFF * self.reach / np.maximum(self.size, np.finfo(np.float64).tiny)
-        # Nodes i and j of edge e lie opposite the two faces that meet in the opposite edge, which is edge 5 - e.
-        for edge, (i, j) in enumerate(reversed(_FACE_PAIRS)):
-            product = _dot(self.normals[i], self.normals[j])
-            product[np.abs(product) <= right * np.minimum(squares[i], squares[j])] = 0.0
-            np.multiply(product, weight, out=entries[edge])
-        return entries
-
-
-def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
-    """Yield, for one chunk of tetrahedra (t, 4) after another, its slice of `tets` and its shapes, to save memory."""
-    columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
-    reach = float(np.abs(columns).max(initial=0.0))
-    for start in range(0, len(tets), _CHUNK):
-        which = slice(start, min(start + _CHUNK, len(tets)))
-        nodes = np.ascontiguousarray(tets[which].T)
-        origin = columns.take(nodes[0], axis=1)
-        a, b, c = (columns.take(nodes[n], axis=1) - origin for n in (1, 2, 3))
-        one, two, three = _cross(b, c), _cross(c, a), _cross(a, b)
-        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one), reach)
+_LEAST = float(np.finfo(np.float64).tiny)
 
 
 def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
     """Return volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative for tetrahedra turned over."""
     volumes = np.empty(len(tets))
-    for which, shapes in shapes_in_chunks(points, tets):
-        volumes[which] = shapes.six_volumes / 6.0
+    _volumes(*_checked(points, tets), volumes)
     return volumes
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the cross products of the columns of a and b, shape (3, t)."""
-    out = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(a[j], b[k], out=out[i])
-        out[i] -= a[k] * b[j]
-    return out
+def flatness(points: FloatArray, tets: IntArray) -> FloatArray:
+    """Return the least height of each tetrahedron over its longest side along an axis, (t,); below 0 if turned over."""
+    flat = np.zeros(len(tets))
+    _flatness(*_checked(points, tets), flat)
+    return flat
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the dot products of the columns of a and b, shape (t,)."""
-    out = a[0] * b[0]
-    out += a[1] * b[1]
-    out += a[2] * b[2]
-    return out
+def dihedral_cosines(points: FloatArray, tets: IntArray) -> FloatArray:
+    """Return the cosines of the dihedral angles at `TET_EDGES`, shape (t, 6); angles at a face without area are 0."""
+    cosines = np.ones((len(tets), 6))
+    _cosines(*_checked(points, tets), cosines)
+    return cosines
+
+
+def edge_stiffness(points: FloatArray, tets: IntArray) -> FloatArray:
+    """Return the stiffness entries of each tetrahedron's edges at conductivity 1, shape (t, 6), [m].
+
+    For linear shape functions f the entry of edge ij is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V), n being normals
+    of faces as long as twice their areas. This equals -l cot(a) / 6 with the length l of the opposite edge and the
+    dihedral angle a there: the entry is positive if a is obtuse, and 0 if a is right up to round-off of the
+    coordinates, or if V is 0.
+    """
+    entries = np.zeros((len(tets), 6))
+    _stiffness(*_checked(points, tets), _ANGLE_ROUND_OFF * float(np.abs(points).max(initial=0.0)), entries)
+    return entries
+
+
+def _checked(points: FloatArray, tets: IntArray) -> tuple[FloatArray, IntArray]:
+    if len(tets) and not 0 <= tets.min() <= tets.max() < len(points):
+        raise IndexError(f"nodes {tets.min()} to {tets.max()} of tetrahedra, but there are {len(points)} points")
+    return np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(tets, dtype=np.int64)
+
+
+@kernel
+def _shape(points: FloatArray, tet: IntArray, normals: FloatArray, squares: FloatArray):
+    """Return six times a tetrahedron's signed volume, and the longest extent of its sides along an axis.
+
+    Written are the inward normals of the faces opposite nodes 0 to 3, `normals` (4, 3), as long as twice the areas, and
+    the squares of their lengths (4,).
+    """
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = _sides(points, tet)
+    normals[1, 0], normals[1, 1], normals[1, 2] = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    normals[2, 0], normals[2, 1], normals[2, 2] = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    normals[3, 0], normals[3, 1], normals[3, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    for k in range(3):
+        normals[0, k] = -(normals[1, k] + normals[2, k] + normals[3, k])
+    for face in range(4):
+        squares[face] = _dot(normals, face, face)
+    size = max(abs(ax), abs(ay), abs(az), abs(bx), abs(by), abs(bz), abs(cx), abs(cy), abs(cz))
+    return ax * normals[1, 0] + ay * normals[1, 1] + az * normals[1, 2], size
+
+
+@kernel
+def _sides(points: FloatArray, tet: IntArray):
+    """Return the vectors from node 0 of a tetrahedron to nodes 1, 2 and 3, [m]."""
+    ox, oy, oz = points[tet[0], 0], points[tet[0], 1], points[tet[0], 2]
+    a, b, c = tet[1], tet[2], tet[3]
+    one = (points[a, 0] - ox, points[a, 1] - oy, points[a, 2] - oz)
+    two = (points[b, 0] - ox, points[b, 1] - oy, points[b, 2] - oz)
+    return one, two, (points[c, 0] - ox, points[c, 1] - oy, points[c, 2] - oz)
+
+
+@kernel
+def _dot(rows: FloatArray, i: int, j: int):
+    return rows[i, 0] * rows[j, 0] + rows[i, 1] * rows[j, 1] + rows[i, 2] * rows[j, 2]
+
+
+@kernel
+def _volumes(points: FloatArray, tets: IntArray, volumes: FloatArray):
+    for t in range(len(tets)):
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = _sides(points, tets[t])
+        volumes[t] = (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6.0
+
+
+@kernel
+def _flatness(points: FloatArray, tets: IntArray, flat: FloatArray):
+    normals, squares = np.empty((4, 3)), np.empty(4)
+    for t in range(len(tets)):
+        six_volumes, size = _shape(points, tets[t], normals, squares)
+        largest = math.sqrt(max(squares[0], squares[1], squares[2], squares[3]))
+        if largest > 0.0:
+            flat[t] = six_volumes / (largest * size)
+
+
+@kernel
+def _cosines(points: FloatArray, tets: IntArray, cosines: FloatArray):
+    normals, squares = np.empty((4, 3)), np.empty(4)
+    for t in range(len(tets)):
+        _shape(points, tets[t], normals, squares)
+        for edge, (i, j) in enumerate(_FACE_PAIRS):
+            scale = math.sqrt(squares[i]) * math.sqrt(squares[j])
+            if scale > 0.0:
+                cosines[t, edge] = min(max(-_dot(normals, i, j) / scale, -1.0), 1.0)
+
+
+@kernel
+def _stiffness(points: FloatArray, tets: IntArray, round_off_m: float, entries: FloatArray):
+    normals, squares = np.empty((4, 3)), np.empty(4)
+    for t in range(len(tets)):
+        six_volumes, size = _shape(points, tets[t], normals, squares)
+        right = round_off_m / max(size, _LEAST)
+        # Nodes i and j of edge e lie opposite the two faces that meet in the opposite edge, which is edge 5 - e.
+        for edge, (i, j) in enumerate(_FACE_PAIRS):
+            product = _dot(normals, i, j)
+            if six_volumes != 0.0 and abs(product) > right * min(squares[i], squares[j]):
+                entries[t, 5 - edge] = product * (1.0 / (6.0 * six_volumes))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import dihedral_cosines, signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
@@ -101,12 +101,8 @@ def _carry_out(points: FloatArray, tets: IntArray, node: IntArray, to: FloatArra
 
 def _sound(points: FloatArray, tets: IntArray) -> BoolArray:
     """Return whether tetrahedra have a volume above 0 and dihedral angles within `ANGLES_DEG`, shape (t,)."""
-    sound, (high, low) = np.empty(len(tets), dtype=bool), np.cos(np.radians(ANGLES_DEG))
-    for which, shapes in shapes_in_chunks(points, tets):
-        cosines = shapes.dihedral_cosines()
-        within = (cosines.max(axis=0) <= high) & (cosines.min(axis=0) >= low)
-        sound[which] = within & (shapes.six_volumes > 0.0)
-    return sound
+    (high, low), cosines = np.cos(np.radians(ANGLES_DEG)), dihedral_cosines(points, tets)
+    return np.all((low <= cosines) & (cosines <= high), axis=1) & (signed_volumes(points, tets) > 0.0)
 
 
 @dataclass(frozen=True)
