@@ -53,8 +53,6 @@ MARGIN = 0.06  # Least cost by which the best plane must beat every plane more t
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by this share of the sum of their planes' distances
 FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
-VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other photographs agree with it
-STEEPEST = 4.0  # Steepest surface, [spacings of planes per pixel]; floors seen at 65 degrees have 0.4 to 0.9
 PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
 LEAST_CORRELATION = 0.6  # With less, a depth on the farthest plane is not accepted
 ERROR_PLANES = 0.1
@@ -131,8 +129,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
                 depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
-    confirmed = other_views(photographs, depth, error)[0] >= VIEWS_TO_CONTRADICT
-    agreeing, behind = other_views(photographs, depth, error, confirmed)
+    agreeing, behind = other_views(photographs, depth, error)
     sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
     for view, first in zip(views, photographs.firsts):
@@ -142,16 +139,11 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     return Depths(photographs, depth, error)
 
 
-def other_views(
-    photographs: Photographs,
-    depth: Float32Array,
-    error: Float32Array,
-    confirmed: BoolArray | None = None,
-) -> tuple[IntArray, IntArray]:
+def other_views(photographs: Photographs, depth: Float32Array, error: Float32Array) -> tuple[IntArray, IntArray]:
     """Count for each pixel the other photographs that agree with its depth, and those that look through its point.
 
     Depths agree if they differ by at most `TOLERANCE` times the sum of both pixels' `error`. A photograph looks through
-    the point if its depth there is `confirmed` and farther by more than twice that sum. All arrays are (pixels,).
+    the point if its depth there is farther by more than twice that sum. All arrays are (pixels,).
     """
     agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
     (known,) = np.nonzero(np.isfinite(depth))
@@ -165,8 +157,7 @@ def other_views(
             farther, planes = depth[pixel] - far, error[pixel] + error[own]  # NaN fails both comparisons
             shown &= number != other
             agreeing[own] += shown & (np.abs(farther) <= TOLERANCE * planes)
-            if confirmed is not None:
-                behind[own] += shown & confirmed[pixel] & (farther > 2.0 * planes)
+            behind[own] += shown & (farther > 2.0 * planes)
 
     run_ranges(compare, len(known), 1 << 15)
     return agreeing, behind
@@ -331,15 +322,13 @@ def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
     """Return which pixels lie in line with `PAIRS_IN_LINE` pairs of opposite neighbours, of four, shape (h, w).
 
     On a plane, inverse depth is linear in the image. The pixel may be off the middle of a pair by one spacing of planes
-    of the sweep, `error`, and inverse depth may change by at most `STEEPEST` spacings per pixel: a wrong depth halfway
-    across an outline is in line, too.
+    of the sweep, `error`.
     """
     height, width = depth.shape
     framed, count = 1.0 / np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
     for row, column in ((0, 0), (0, 1), (0, 2), (1, 0)):
         one, other = (framed[r : r + height, c : c + width] for r, c in ((row, column), (2 - row, 2 - column)))
-        spacing = 2.0 * error / depth**2
-        count += (np.abs(one + other - 2.0 / depth) <= spacing) & (np.abs(one - other) <= STEEPEST * spacing)
+        count += np.abs(one + other - 2.0 / depth) <= 2.0 * error / depth**2
     return count >= PAIRS_IN_LINE
 
 
