@@ -27,9 +27,9 @@ def path(count=40, size_m=30.0, seed=0):
 
 
 def test_lengths_of_degrees_are_those_of_the_ellipsoid():
-    local = local_metres([GpsFix(48.0, 11.0, 1.0), GpsFix(48.001, 11.001, None), GpsFix(48.0, 11.0, 3.0)])
-    assert local[1, :2] - local[0, :2] == pytest.approx([74.63, 111.20], abs=0.02)
-    assert local[:, 2] == pytest.approx([-1, 0, 1])
+    local = local_metres([*(GpsFix(48.0, 11.0, height) for height in (1.0, None, 3.0)), GpsFix(48.001, 11.001, 2.0)])
+    assert local[3, :2] - local[0, :2] == pytest.approx([74.63, 111.20], abs=0.02)
+    assert local[:3, 2] - local[1, 2] == pytest.approx([-1, 0, 1])
     across = local_metres([GpsFix(0.0, 179.9999, 0.0), GpsFix(0.0, -179.9999, 0.0)])  # the date line
     assert abs(across[1, 0] - across[0, 0]) == pytest.approx(22.26, abs=0.01)
 

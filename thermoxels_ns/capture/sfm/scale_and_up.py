@@ -19,7 +19,6 @@ from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.data.scene_scale import SceneScale
 
-_EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
 _WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is accepted
 _LEAST_FIXES = 4
 _MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
@@ -68,20 +67,14 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
 
 def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
     """Return how far east, north and above the mean each fix is, (n, 3), [m]; a missing altitude counts as the mean."""
-    latitude = np.radians([fix.latitude_deg for fix in fixes])
-    longitude = np.radians([fix.longitude_deg for fix in fixes])
-    heights = [fix.altitude_m for fix in fixes]
-    known = [height for height in heights if height is not None]
+    import pycolmap
+
+    known = [fix.altitude_m for fix in fixes if fix.altitude_m is not None]
     usual = float(np.mean(known)) if known else 0.0
-    altitude = np.array([usual if height is None else height for height in heights])
-    middle = float(latitude.mean())
-    squared = _FLATTENING * (2.0 - _FLATTENING)
-    bend = 1.0 - squared * math.sin(middle) ** 2
-    north_radius = _EARTH_RADIUS_M * (1.0 - squared) / bend**1.5
-    east_radius = _EARTH_RADIUS_M / math.sqrt(bend) * math.cos(middle)
-    turned = np.angle(np.exp(1j * (longitude - longitude[0])))  # also across the date line
-    east = east_radius * (turned - turned.mean())
-    return np.stack([east, north_radius * (latitude - middle), altitude - altitude.mean()], axis=1)
+    heights = [usual if fix.altitude_m is None else fix.altitude_m for fix in fixes]
+    places = np.array([(fix.latitude_deg, fix.longitude_deg, height) for fix, height in zip(fixes, heights)])
+    metres = pycolmap.GPSTransform().ellipsoid_to_enu(places, *places[0])
+    return metres - metres.mean(axis=0)
 
 
 def scale_from_markers(
