@@ -90,8 +90,9 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
     """
     from threadpoolctl import threadpool_limits
 
-    from thermoxels_ns.commands.export import load_trained_scene, scene_json
+    from thermoxels_ns.commands.export import load_trained_scene
     from thermoxels_ns.core.config_loader import check_run
+    from thermoxels_ns.data.layouts import scene_json
     from thermoxels_ns.data.scene_scale import choose_scale
     from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT
 
@@ -108,7 +109,7 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
             trained = load_trained_scene(config)
         finally:
             CONSOLE.quiet, sys.excepthook = loud, hook
-    scale, field = choose_scale(metres_per_unit, None, scene_json(trained.scene_folder)), trained.snapshot
+    scale, field = choose_scale(metres_per_unit, None, scene_json(trained.scene_folder)[1]), trained.snapshot
     metres = None if scale is None else scale.metres_per_unit
     units = (metres or 1.0) * float(np.cbrt(abs(np.linalg.det(trained.world_to_input[:3, :3]))))
     measured = field.observed_weight >= MIN_OBSERVED_WEIGHT

@@ -19,12 +19,12 @@ from thermoxels_ns.commands.export import (
     TrainedScene,
     check_options,
     export_scene,
-    scene_json,
     viewpoint_of_cameras,
 )
 from thermoxels_ns.core.errors import CheckpointError, MeshError, OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.data.layouts import scene_json
 from thermoxels_ns.mesh.boundary.patches import PatchRules
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.multiview.photographs import Photographs
@@ -297,7 +297,7 @@ def test_truth_that_cannot_be_used_does_not_cost_the_export(small, tmp_path, tru
 
 def test_the_scene_json_may_begin_with_the_mark_that_windows_editors_write(tmp_path) -> None:
     (tmp_path / "transforms.json").write_text('{"metres_per_unit": 2.0}', encoding="utf-8-sig")
-    assert scene_json(tmp_path) == scene_json(tmp_path / "transforms.json") == {"metres_per_unit": 2.0}
+    assert scene_json(tmp_path)[1] == scene_json(tmp_path / "transforms.json")[1] == {"metres_per_unit": 2.0}
 
 
 def test_summary_says_how_much_of_the_surface_was_measured(ball, tmp_path) -> None:

@@ -219,7 +219,7 @@ def exact_rays(
     origin = input_to_world[:3, :3] @ pose[:3, 3] + input_to_world[:3, 3]
     directions = truth.camera.directions(pose).reshape(-1, 3) @ input_to_world[:3, :3].T * scale
     origins = np.tile(origin, (len(directions), 1))
-    depth, hit = view.depth_m.ravel() / scale, view.hit.ravel()
+    depth, hit = view.depth_m.ravel() / scale, np.isfinite(view.depth_m.ravel())
     ends = np.linspace(0.0, 2.0 * np.nanmax(depth[hit]), 300)[:, None, None] * directions + origins
     index = lattice.world_to_index(ends)
     in_box = ((index >= 0) & (index <= lattice.cell_shape)).all(-1).any(0)

@@ -105,7 +105,7 @@ def known_capture(
         measured = render_view(scene, pose @ to_visible, thermal).temperature_c
         measured = measured + offsets[number] + radial[0] * r2 + radial[1] * r2 * r2
         temperatures.append((measured + 0.05 * draw.standard_normal(measured.shape)).astype(np.float32))
-        seen = np.flatnonzero(view.hit.ravel())
+        seen = np.flatnonzero(np.isfinite(view.depth_m.ravel()))
         chosen = draw.choice(seen, min(900, len(seen)), replace=False)
         directions = plain.directions(pose).reshape(-1, 3)
         world.append(pose[:3, 3] + view.depth_m.ravel()[chosen, None] * directions[chosen])

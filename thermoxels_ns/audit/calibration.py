@@ -175,10 +175,6 @@ class _Wall:
             found[name] = np.concatenate([[before], means[:-1], values[-1:]])
         return found
 
-    def measured_c(self, draws: Draws) -> FloatArray:
-        """Return the corrected temperature of every triangle in `counted`, shape (c,), [degrees Celsius]."""
-        return triangle_exchange(self.conditions, self.surface, draws).surface_c[self.counted]
-
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
         """Return the temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
 
@@ -268,14 +264,15 @@ class _Fit:
         self.start = {name: self.stated[name].value for name in self.names}
         area = wall.surface.area_m2[wall.counted]
         self.weight = area / area.sum()
-        self._first = draws.stated
+        self._first = draws.first(0)
         self.logarithm = self._search()
 
     def _residual(self, logarithm: FloatArray, draws: Draws, known: Mapping[str, float] | None = None) -> FloatArray:
         values = {name: one.value for name, one in self.stated.items()} | dict(known or {})
         values |= {name: self.start[name] * float(np.exp(x)) for name, x in zip(self.names, logarithm)}
-        measured = self.wall.measured_c(draws)
-        return measured - self.wall.computed_c(values, draws, measured)
+        wall = self.wall
+        measured = triangle_exchange(wall.conditions, wall.surface, draws).surface_c[wall.counted]
+        return measured - wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
         """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method in a trust region."""

@@ -70,11 +70,6 @@ class Draws:
         return len(next(iter(self.values.values())))
 
     @property
-    def stated(self) -> Draws:
-        """Draws that hold the stated values alone, shape (1,) each."""
-        return Draws({name: values[:1] for name, values in self.values.items()})
-
-    @property
     def difference_k(self) -> FloatArray:
         """Inside minus outside air, shape (1 + k,), [K], above 0; NaN if no outside temperature is stated."""
         return self["inside air"] - self["outside air"]

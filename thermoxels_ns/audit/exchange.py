@@ -68,7 +68,7 @@ def triangle_exchange(conditions: Conditions, surface: AuditedSurface, draws: Dr
 
 def _around(conditions: Conditions, groups: Readings, draws: Draws) -> list[Exchange]:
     """Return the stated exchange with readings lower by `HALF_STEP_K`, as they are, and higher by it."""
-    return [exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K)]
+    return [exchange(conditions, groups, draws.first(0), step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K)]
 
 
 class Parts:

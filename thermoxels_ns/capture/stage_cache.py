@@ -40,18 +40,19 @@ def run_stage(
     """
     content = json.dumps([__version__, _FORMAT, folder.name, depends_on], sort_keys=True, default=str)
     key = hashlib.sha256(content.encode()).hexdigest()
-    stale = again or _read(folder / _KEY_FILE) != key
+    kept = folder / _KEY_FILE
+    stale = again or not kept.is_file() or kept.read_text(encoding="utf-8") != key
     if not stale and (folder / _DONE_FILE).is_file():
         say(f"{folder.name}: as before")
         return key
     remove_file(folder / _DONE_FILE)
     if stale:
         # The key is removed first, so that a process killed in between leaves no folder that seems valid.
-        remove_file(folder / _KEY_FILE)
+        remove_file(kept)
         if folder.is_dir():
             shutil.rmtree(folder)
     writable_folder(folder)
-    with replace_when_done(folder / _KEY_FILE) as temporary:
+    with replace_when_done(kept) as temporary:
         temporary.write_text(key, encoding="utf-8")
     work(folder)
     (folder / _DONE_FILE).touch()
@@ -72,13 +73,6 @@ def prepare_output(folder: Path) -> Path:
         raise OutputError("output", expected="an empty folder or one of an earlier capture", got=got, remedy=remedy)
     writable_folder(folder / CACHE_FOLDER)
     return folder
-
-
-def _read(file: Path) -> str | None:
-    try:
-        return file.read_text(encoding="utf-8")
-    except OSError:
-        return None
 
 
 def save_rig(path: Path, rig: RigEstimate) -> None:

@@ -18,10 +18,11 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
-from thermoxels_ns.core.errors import CheckpointError, MeshError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
+from thermoxels_ns.core.errors import CheckpointError, MeshError, ThermoxelsError
+from thermoxels_ns.core.json_values import plain_values, write_json
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.core.version import __version__
+from thermoxels_ns.data.layouts import scene_json
 from thermoxels_ns.data.scene_scale import (
     SceneScale,
     choose_scale,
@@ -196,7 +197,7 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     from thermoxels_ns.multiview.stereo import depths_of
 
     selection, rules, distance = check_options(options)
-    scene_file, lattice = scene_json(run.scene_folder), run.snapshot.lattice
+    scene_file, lattice = scene_json(run.scene_folder)[1], run.snapshot.lattice
     scale = choose_scale(options.metres_per_unit, distance, scene_file)
     needs = ["--formats inp"] * ("inp" in options.formats) + ["--wall-thickness"] * (options.wall_thickness is not None)
     needs += ["--patches"] * (options.patches is not None)
@@ -354,18 +355,6 @@ def _against_truth(run: TrainedScene, made: SceneMesh, say: Say) -> dict[str, An
     if truth is not None:
         say(f"Against the truth: F-score {truth['fscore']:.3g}; more in {_SUMMARY}.")
     return truth
-
-
-def scene_json(scene_folder: Path) -> dict[str, Any]:
-    """Return the content of the scene's json, unchecked; empty if the scene has no json, as with COLMAP."""
-    from thermoxels_ns.data.layouts import JSON_NAMES
-
-    folder = scene_folder if scene_folder.is_dir() else scene_folder.parent
-    names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]
-    for path in names:
-        if path.is_file():
-            return read_json_object(path, "Write the file again.", SceneError)
-    return {}
 
 
 def load_trained_scene(load_config: Path) -> TrainedScene:

@@ -62,16 +62,24 @@ class SceneSource:
     left_out: list[str] = field(default_factory=list)  # names of photographs that only the COLMAP model has
 
 
+def scene_json(data: Path) -> tuple[Path | None, dict[str, Any]]:
+    """Return the json of a scene folder, or `data` if it is one itself, and its content, unchecked; None and {}: none.
+
+    COLMAP scenes have none. Raises `SceneError` if it cannot be read.
+    """
+    named = [data] if data.is_file() and data.suffix == ".json" else [data / name for name in JSON_NAMES]
+    path = next((path for path in named if path.is_file()), None)
+    return path, {} if path is None else read_json_object(path, "Write the file again.", SceneError)
+
+
 def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
     """Recognise the layout of a scene folder (or of that of a json), or take the one that is `wanted`.
 
     Raises:
         SceneError: There are no poses, or not the parts of the layout; the json or the COLMAP model cannot be used.
     """
-    named = [data] if data.is_file() and data.suffix == ".json" else [data / name for name in JSON_NAMES]
-    json_path = next((path for path in named if path.is_file()), None)
+    json_path, content = scene_json(data)
     folder = data if json_path is None else json_path.parent
-    content = {} if json_path is None else read_json_object(json_path, "Write the file again.", SceneError)
     frames = content.get("frames")
     keys = {key for frame in frames if isinstance(frame, dict) for key in frame} if isinstance(frames, list) else set()
     model = next((folder / place for place in COLMAP_FOLDERS if is_model(folder / place)), None)

@@ -161,16 +161,9 @@ class KnownTruth:
 
     def views(self, world_to_truth: FloatArray) -> Views:
         """Return the training cameras in the world that the similarity (4, 4) brings to the scene's coordinates."""
-        scale = _scale_of(world_to_truth)
-        poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
-        axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
-        centres = (poses[:, :3, 3] - world_to_truth[:3, 3]) @ axes.T / scale
-        return Views(
-            camera_to_world=np.concatenate([axes @ poses[:, :3, :3], centres[:, :, None]], axis=2),
-            focal=np.tile([camera.fl_x, camera.fl_y], (count, 1)),
-            centre=np.tile([camera.cx, camera.cy], (count, 1)),
-            size=np.tile([camera.width, camera.height], (count, 1)),
-        )
+        poses = np.linalg.inv(world_to_truth) @ self.training_poses
+        poses[:, :3, :3] *= _scale_of(world_to_truth)  # axes stay 1 long
+        return Views.of([self.camera] * len(poses), list(poses))
 
 
 def _scale_of(similarity: FloatArray) -> float:

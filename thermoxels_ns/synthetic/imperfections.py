@@ -44,12 +44,7 @@ class Imperfections:
     passers_by: float = 0.0
     """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
-    def check(self) -> None:
-        """Check the range of every option.
-
-        Raises:
-            ThermoxelsError: An option is out of range; the message has its name, range and value.
-        """
+    def __post_init__(self) -> None:
         limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
         limits |= {"passers_by": (0.0, 1.0, "from 0 to 1"), "pose_correlation": (0.0, 0.999, "from 0 to 0.999")}
         limits |= {"focal_error": (-0.5, 1.0, "from -0.5 to 1")}

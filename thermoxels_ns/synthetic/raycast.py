@@ -26,11 +26,6 @@ class RenderedView:
     depth_m: FloatArray
     """Distance along the ray to the scene's solid [m], infinite if the ray first meets something else or nothing."""
 
-    @property
-    def hit(self) -> BoolArray:
-        """True for pixels whose central ray first meets the scene's solid, shape (height, width)."""
-        return np.isfinite(self.depth_m)
-
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
     """Return what a camera sees from a camera-to-world pose, shape (3, 4) or (4, 4) [m].

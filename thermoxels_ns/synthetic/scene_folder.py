@@ -89,7 +89,6 @@ def write_scene(
         expected = "one camera for both, which is all that this layout can say"
         remedy = "Leave --own-thermal-camera out, or pass --layout thermalnerf."
         raise SceneError("own_thermal_camera", expected=expected, got=f"True and layout {layout}", remedy=remedy)
-    imperfections.check()
     camera = scene.camera(width, height)
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
