@@ -52,7 +52,7 @@ class StepSpeed:
 
     def main(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            scene = write_scene(make_scene(SCENE), Path(folder) / "scene", own_thermal_camera=True, thermal_width=320)
+            scene = write_scene(make_scene(SCENE), Path(folder) / "scene", own_thermal_camera=True)
             rows = [self.measure(scene, resolution) for resolution in self.resolutions]
         print(
             f"\n{SCENE}, {self.rays} RGB + {self.rays} thermal rays, {num_threads()} threads, "

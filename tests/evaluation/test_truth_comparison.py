@@ -266,7 +266,7 @@ def test_surroundings_within_the_lattice_are_no_sky():
 
 def test_ns_eval_compares_the_trained_density_with_the_scene(tmp_path, monkeypatch):
     """A field that holds the exact scene, in the trained world's own coordinates, scores full."""
-    write_boxed_scene(make_scene("hot-object"), tmp_path, 8, 2, width=24, height=18, thermal_width=8)
+    write_boxed_scene(make_scene("hot-object"), tmp_path, 8, 2, width=24, height=18, own_thermal_camera=True)
     pipeline = train(tmp_path, steps=0)
     averages = pipeline.get_average_eval_image_metrics()  # as in a training: without the geometry
     assert 0.0 < averages["half_transparent"] <= 1.0 and "fscore" not in averages
@@ -289,4 +289,4 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(tmp_path, monkeypat
     assert averages["depth_error"] > 0.0 and 0.0 < averages["depth_off_share"] <= 1.0 and averages["sky_filled"] == 0.0
     assert "fscore_std" not in averages and "half_transparent_std" in averages
     # What is solid is decided as in an export, by the rays and cameras of both streams.
-    assert asked == [({RGB_STREAM, THERMAL_STREAM}, [24] * 8 + [8] * 8)]
+    assert asked == [({RGB_STREAM, THERMAL_STREAM}, [24] * 8 + [12] * 8)]

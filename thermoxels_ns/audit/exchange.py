@@ -110,7 +110,7 @@ class Parts:
         step = max(1, CHUNK // draws.count)
         for start in range(0, len(self.groups.reading_c), step):
             part = slice(start, start + step)
-            some = exchange(self.conditions, self.groups.some(part), draws)
+            some = exchange(self.conditions, Readings(*(values[part] for values in self.groups)), draws)
             surface_c += rows[:, part] @ some.surface_c
             flow_w += rows[:, part] @ some.flow_w_m2
         area = self.area_m2[:first, None]

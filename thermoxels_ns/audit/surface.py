@@ -40,10 +40,6 @@ class Readings(NamedTuple):
     upward: FloatArray  # Upward part of the outward unit normal, shape (n,)
     surface_entry: IntArray  # Place in `Conditions.surfaces` of the emissivity, shape (n,)
 
-    def some(self, part: slice) -> Readings:
-        """Return the pieces of surface in a slice."""
-        return Readings(self.reading_c[part], self.upward[part], self.surface_entry[part])
-
 
 @dataclass(frozen=True)
 class AuditedSurface:

@@ -76,7 +76,7 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
     temperature_c = scene.drift.corrected(number, np.load(frame.thermal))
     Image.fromarray(temperature_c).save(folder / "thermal" / f"{name}.tiff")
     pose = scene.model.camera_to_world[number]
-    entry: dict[str, Any] = {
+    return {
         "file_path": f"images/{photograph.name}",
         "thermal_file_path": f"thermal/{name}.tiff",
         "transform_matrix": pose.tolist(),
@@ -84,7 +84,6 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
         "source": frame.name,
         "thermal_source": frame.thermal_source,
     }
-    return entry
 
 
 def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:

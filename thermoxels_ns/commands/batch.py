@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, fields
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import tyro
 
@@ -312,10 +312,6 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _end(*_: Any) -> NoReturn:
-    sys.exit(_ENDED)  # ends the command of the stage, too
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(_ENDED))  # ends the command of the stage, too
     sys.exit(run_stage(sys.argv[1], sys.argv[2], int(sys.argv[3])))

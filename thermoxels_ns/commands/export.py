@@ -235,7 +235,6 @@ def export_scene(
     """
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_start, write_mesh
 
-    check_options(options)
     folder = prepare_folder(output_dir)
     made = mesh_of_scene(run, options)
     mesh, figures, unit = made.built.mesh, made.figures, made.unit

@@ -58,7 +58,6 @@ def write_scene(
     num_eval: int = 6,
     width: int = 320,
     height: int = 240,
-    thermal_width: int | None = None,
     seed: int = 0,
     own_thermal_camera: bool = False,
     photo_format: PhotoFormat = "jpeg",
@@ -75,15 +74,15 @@ def write_scene(
     exact box and the drawn `imperfections` go to ``truth.json``, which training never reads.
 
     The folder is made if absent; an earlier synthetic scene in it is removed, any other scene is refused. Held-out
-    views lie half-way between training views. `thermal_width` [pixels] is by default the width of photographs, or half
-    of it with `own_thermal_camera`, whose lens and poses are written as ``thermal_camera`` and
-    ``thermal_transform_matrix``. The same `seed` writes the same bytes.
+    views lie half-way between training views. With `own_thermal_camera`, thermal images are half as wide as
+    photographs and have a lens and poses of their own, ``thermal_camera`` and ``thermal_transform_matrix``. The same
+    `seed` writes the same bytes.
 
     Raises:
         SceneError: An option is out of range, or the folder contains a scene that is not synthetic.
         OutputError: The folder cannot be written to.
     """
-    thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
+    thermal_camera, offset = _thermal_camera(scene, width, height, own_thermal_camera)
     photographs, thermals, model = _FOLDERS[layout]
     if own_thermal_camera and (model or not thermals):
         expected = "one camera for both, which is all that this layout can say"
@@ -215,30 +214,23 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
     return make_scene(truth["synthetic_scene"])
 
 
-def _thermal_camera(
-    scene: SyntheticScene, width: int, height: int, thermal_width: int | None, own: bool
-) -> tuple[Camera, FloatArray]:
+def _thermal_camera(scene: SyntheticScene, width: int, height: int, own: bool) -> tuple[Camera, FloatArray]:
     """Return the camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
 
-    With `own`, the thermal camera has a slightly different field of view and an off-centre principal point. Otherwise
-    it differs in pixels only; `SceneError` is raised if `thermal_width` does not keep the aspect in whole pixels.
+    With `own`, the thermal camera has half as many columns, a slightly different field of view and an off-centre
+    principal point; otherwise it is the photographs' camera.
     """
-    chosen = thermal_width if thermal_width is not None else max(width // 2, 1) if own else width
-    sizes = {"width": width, "height": height, "thermal_width": chosen}
+    sizes = {"width": width, "height": height}
     check_ranges("--", {name: (value, 1, _MOST_SIDE, f"1 to {_MOST_SIDE} pixels") for name, value in sizes.items()})
-    if own:
-        plain = scene.camera(chosen, max(round(chosen * _THERMAL_ASPECT), 1))
-        focal, (dx, dy) = plain.fl_x * _THERMAL_ZOOM, (chosen * shift for shift in _THERMAL_CENTRE_SHIFT)
-        offset = np.eye(4)
-        offset[:3, :3] = Rotation.from_euler("xyz", _RIG_ROTATION_RAD).as_matrix()
-        offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, scene.size)
-        return replace(plain, fl_x=focal, fl_y=focal, cx=plain.cx + dx, cy=plain.cy + dy), offset
-    if height * chosen % width:
-        expected = f"a width that keeps the aspect {width}:{height} in whole pixels"
-        got = f"{chosen}, for a height of {height * chosen / width:.2f}"
-        remedy = f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera."
-        raise SceneError("thermal_width", expected=expected, got=got, remedy=remedy)
-    return scene.camera(chosen, height * chosen // width), np.eye(4)
+    offset = np.eye(4)
+    if not own:
+        return scene.camera(width, height), offset
+    columns = max(width // 2, 1)
+    plain = scene.camera(columns, max(round(columns * _THERMAL_ASPECT), 1))
+    focal, (dx, dy) = plain.fl_x * _THERMAL_ZOOM, (columns * shift for shift in _THERMAL_CENTRE_SHIFT)
+    offset[:3, :3] = Rotation.from_euler("xyz", _RIG_ROTATION_RAD).as_matrix()
+    offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, scene.size)
+    return replace(plain, fl_x=focal, fl_y=focal, cx=plain.cx + dx, cy=plain.cy + dy), offset
 
 
 def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
