@@ -107,12 +107,13 @@ class Parts:
         """
         rows = self._rows[:first]
         surface_c, flow_w = (np.repeat(off[:first], draws.count, axis=1) for off in self._off)
-        step = max(1, CHUNK // draws.count)
-        for start in range(0, len(self.groups.reading_c), step):
+        groups, step = self.groups, max(1, CHUNK // draws.count)
+        for start in range(0, len(groups.reading_c), step):
             part = slice(start, start + step)
-            some = exchange(self.conditions, Readings(*(values[part] for values in self.groups)), draws)
-            surface_c += rows[:, part] @ some.surface_c
-            flow_w += rows[:, part] @ some.flow_w_m2
+            some = Readings(groups.reading_c[part], groups.upward[part], groups.surface_entry[part])
+            found = exchange(self.conditions, some, draws)
+            surface_c += rows[:, part] @ found.surface_c
+            flow_w += rows[:, part] @ found.flow_w_m2
         area = self.area_m2[:first, None]
         return surface_c / np.where(area > 0.0, area, 1.0), flow_w
 

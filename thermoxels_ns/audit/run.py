@@ -198,14 +198,12 @@ class Audit(HasTables):
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
         """Return the results by patch, defect and limit; an interval has columns of its own for both ends."""
-        patches = lines_of((*self.patches, self.whole))
-        others = {name: lines_of(getattr(self, name)) for name in ("defects", "limits")}
         year = self.energy
-        energy = [] if year is None else lines_of((*year.elements, year.whole))
         return {
-            "patches": patches,
-            **others,
-            "energy": energy,
+            "patches": lines_of((*self.patches, self.whole)),
+            "defects": lines_of(self.defects),
+            "limits": lines_of(self.limits),
+            "energy": [] if year is None else lines_of((*year.elements, year.whole)),
             "savings": [] if year is None else lines_of(year.savings),
         }
 

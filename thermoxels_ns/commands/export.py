@@ -143,14 +143,10 @@ class ExportThermoxelsMesh(ExportOptions):
         """Run the export; raises `ThermoxelsError` for wrong options, an unusable run, or if nothing is solid."""
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            self.run(partial(print, flush=True))
-
-    def run(self, say: Say) -> dict[str, Any]:
-        """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""
-        check_options(self)
-        prepare_folder(self.output_dir)
-        say(f"Loading {self.load_config}")
-        return export_scene(load_trained_scene(self.load_config), self, self.output_dir, say)
+            check_options(self)
+            prepare_folder(self.output_dir)
+            print(f"Loading {self.load_config}", flush=True)
+            export_scene(load_trained_scene(self.load_config), self, self.output_dir, partial(print, flush=True))
 
 
 def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, SceneScale | None]:
