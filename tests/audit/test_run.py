@@ -41,6 +41,7 @@ def walls() -> dict[str, Truth]:
         "plain": solve_wall(audited_wall(slab=False, window=False), STATED, draws),
         "window": solve_wall(audited_wall(slab=False), STATED, draws),
         "balcony": solve_wall(audited_wall(), STATED, draws),
+        "room": solve_wall(audited_wall(slab=False, window=False, side="inside"), INSIDE, true_draws(INSIDE, None)),
     }
 
 
@@ -262,10 +263,9 @@ def test_a_film_model_may_be_chosen(walls, model, coefficient) -> None:
     assert found.u_w_m2k.value == pytest.approx((coefficient * warm_c + radiation) / 20.0)
 
 
-def test_a_room_seen_from_within() -> None:
+def test_a_room_seen_from_within(walls) -> None:
     """Heat flow by the coefficient of the solver, temperature factor by the wall's own resistances."""
-    room = audited_wall(slab=False, window=False, side="inside")
-    truth = solve_wall(room, INSIDE, true_draws(INSIDE, None))
+    truth = walls["room"]
     near = replace(INSIDE, camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)), limits=Limits(f_rsi=Measured(0.7)))
     found = audit(photographed(truth, near), near, UP)
     assert found.whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-6)
@@ -377,9 +377,8 @@ def test_wrinkles_of_a_reconstructed_wall_are_no_heat_loss_of_a_bridge() -> None
     assert found.whole.area_m2 > 1.04 * 12.0
 
 
-def test_without_the_air_outside_heat_flow_is_told_and_nothing_that_needs_it() -> None:
-    room = audited_wall(slab=False, window=False, side="inside")
-    truth = solve_wall(room, INSIDE, true_draws(INSIDE, None))
+def test_without_the_air_outside_heat_flow_is_told_and_nothing_that_needs_it(walls) -> None:
+    truth = walls["room"]
     unknown = replace(INSIDE, outside=OutsideAir(wind=INSIDE.outside.wind), limits=Limits(u={"*": Measured(0.5)}))
     known, found = (audit(photographed(truth, one), one, UP) for one in (INSIDE, unknown))
     assert found.whole.loss_w == known.whole.loss_w
@@ -440,12 +439,16 @@ def test_cold_places_are_no_defects_from_outside_and_are_from_inside(plate) -> N
     assert [one.kind for one in found] == ["area"]
 
 
-def test_noise_and_drift_make_no_defect(plate) -> None:
+def test_noise_drift_and_what_departs_less_than_readings_repeat_make_no_defect(plate) -> None:
     generator = np.random.default_rng(5)
     for _ in range(5):
         drift = 0.2 * np.sin(plate.points_m @ generator.uniform(-2, 2, 3) + generator.uniform(0, 6))
         noisy = replace(plate, temperature_c=2.0 + drift + generator.normal(0, 0.15, len(drift)))
         assert audit(noisy, STATED, UP).defects == ()
+    faint = painted(plate, block, 2.5)
+    assert len(audit(faint, STATED, UP).defects) == 1
+    coarse = replace(STATED, camera=Camera(Measured(0.0, 1.0), Measured(0.0, 0.4)))
+    assert audit(faint, coarse, UP).defects == ()
 
 
 def test_a_bridge_weaker_than_the_slow_changes_of_a_wall_is_found(plate) -> None:
@@ -456,13 +459,6 @@ def test_a_bridge_weaker_than_the_slow_changes_of_a_wall_is_found(plate) -> None
     assert found.kind == "line" and found.length_m == pytest.approx(2.2, rel=0.1)
     assert found.departure_k == pytest.approx(0.6 / 0.93, rel=0.1)
     assert audit(replace(plate, temperature_c=slow), STATED, UP).defects == ()
-
-
-def test_what_departs_less_than_readings_repeat_is_none(plate) -> None:
-    faint = painted(plate, block, 2.5)
-    assert len(audit(faint, STATED, UP).defects) == 1
-    coarse = replace(STATED, camera=Camera(Measured(0.0, 1.0), Measured(0.0, 0.4)))
-    assert audit(faint, coarse, UP).defects == ()
 
 
 @pytest.mark.parametrize(("value", "why"), [(3.0, "edge of its element"), (4.5, "")])

@@ -43,15 +43,12 @@ def test_equal_names_belong_together(photo, thermal):
     assert list(search.unpaired) == ["other.jpg"]
 
 
-def test_the_same_name_in_two_folders_is_told_apart_by_the_folder():
+def test_one_name_in_two_folders_is_told_apart_by_the_folder_and_two_thermal_images_of_it_are_ambiguous():
     search = of(
         *(("day1/visible/a.jpg", "photograph"), ("day1/thermal/a.tif", "thermal")),
         *(("day2/visible/a.jpg", "photograph"), ("day2/thermal/a.tif", "thermal")),
     )
     assert [(p.photograph[:4], p.thermal[:4]) for p in search.pairs] == [("day1", "day1"), ("day2", "day2")]
-
-
-def test_two_thermal_images_of_one_name_are_ambiguous_and_both_named():
     search = of(("a.jpg", "photograph"), ("a.npy", "thermal"), ("a.csv", "thermal"))
     assert search.pairs == ()
     assert set(search.unpaired) == {"a.jpg", "a.npy", "a.csv"}

@@ -208,7 +208,7 @@ def written(capture, tmp_path):
     return scene, folder
 
 
-def test_numbers_come_back_as_they_went_in(written):
+def test_numbers_and_tracks_come_back_as_they_went_in(written):
     scene, folder = written
     read = read_scene_file(folder)
     by_source = {entry["source"]: entry for entry in read.meta["frames"]}
@@ -231,12 +231,9 @@ def test_numbers_come_back_as_they_went_in(written):
     assert up_from_scene_file(read.meta) == pytest.approx((0.0, 0.6, 0.8))
     assert read.meta["fl_x"] == scene.model.camera.fl_x
     assert read.meta["thermal_camera"]["cx"] == scene.rig.thermal_camera.cx
-
-
-def test_tracks_say_which_training_photograph_sees_which_point(written):
-    scene, folder = written
+    # Tracks say which training photograph sees which point.
     outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
-    tracks = find_tracks(read_scene_file(folder))
+    tracks = find_tracks(read)
     np.testing.assert_allclose(tracks.points, scene.model.points, atol=1e-9)
     np.testing.assert_allclose(tracks.point_error_px, scene.model.point_error_px)
     assert sorted(map(len, tracks.seen.values())) == sorted(map(len, scene.model.seen))
@@ -363,23 +360,17 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     assert not frame.photograph.is_relative_to(card)
 
 
-def test_the_rest_goes_on_without_damaged_files(tmp_path):
+def test_the_rest_goes_on_without_damaged_files_and_those_of_another_thermal_camera(tmp_path):
     card = tmp_path / "card"
-    pairs = {name: pair(card, name) for name in ("thermal", "photo")}
-    for path in (card / pairs["thermal"].thermal, card / pairs["photo"].photograph):
+    good, odd = [pair(card, "a"), pair(card, "b")], pair(card, "odd", np.full((6, 8), 20.0))
+    bad = {name: pair(card, name) for name in ("thermal", "photo")}
+    for path in (card / bad["thermal"].thermal, card / bad["photo"].photograph):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    frames = read([*pairs.values(), pair(card, "good")], tmp_path, skip_bad=True)
-    assert [frame.name for frame in frames.frames] == ["good-visible.jpg"]
-    assert set(frames.dropped) == {pair.photograph for pair in pairs.values()}
-    assert all(name.split("-")[0] in why for name, why in frames.dropped.items())
-
-
-def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):
-    card = tmp_path / "card"
-    pairs = [pair(card, "a"), pair(card, "b"), pair(card, "odd", np.full((6, 8), 20.0))]
-    frames = read(pairs, tmp_path)
-    assert [frame.name for frame in frames.frames] == ["a-visible.jpg", "b-visible.jpg"]
-    assert "8 x 6 pixels, most have 16 x 12" in frames.dropped["odd-visible.jpg"]
+    alone, frames = read([*good, odd], tmp_path), read([*bad.values(), *good, odd], tmp_path, skip_bad=True)
+    assert [frame.name for found in (alone, frames) for frame in found.frames] == 2 * [one.photograph for one in good]
+    assert "8 x 6 pixels, most have 16 x 12" in alone.dropped["odd-visible.jpg"]
+    assert set(frames.dropped) == {one.photograph for one in (*bad.values(), odd)}
+    assert all(name.split("-")[0] in why for name, why in frames.dropped.items() if name != odd.photograph)
 
 
 def test_stuck_pixels_become_nan(tmp_path):

@@ -227,19 +227,17 @@ def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, 
     assert asked[0][0] > 0 and asked[0][1] > 6 * asked[0][0] and read(tmp_path)["truth"] == {"fscore": 0.5}
 
 
-def test_a_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, drawn, truth) -> None:
-    """Found at the last moment before files are written: json has no NaN."""
+def test_a_failed_export_leaves_the_earlier_one_and_one_interrupted_while_writing_no_summary(
+    ball, tmp_path, monkeypatch, drawn, truth
+) -> None:
+    """It fails at the last moment before files are written: json has no NaN. A folder with a summary is no mixture."""
     export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
     before = contents(tmp_path)
     truth(lambda *_, **__: {"fscore": float("nan")})
     with pytest.raises(ThermoxelsError):
         export_scene(trained(ball), ExportOptions(density_threshold=6.0, **SCALED), tmp_path)
     assert contents(tmp_path) == before
-
-
-def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, drawn) -> None:
-    """So a folder with a summary is never a mixture."""
-    export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
+    truth(lambda *_, **__: {"fscore": 0.5})
 
     def interrupt(*_, **__) -> None:
         assert not (tmp_path / "summary.json").exists()
@@ -335,13 +333,6 @@ def test_up_of_cameras_that_look_down_is_that_of_their_level_pictures() -> None:
     assert up == pytest.approx((0.0, np.sqrt(0.75), 0.5)) and "the mean" in source
 
 
-def test_up_can_be_given(small, tmp_path_factory) -> None:
-    scene = tmp_path_factory.mktemp("scene")
-    (scene / "transforms.json").write_text('{"up": [0.0, 1.0, 0.0]}')
-    summary = small(up=(0.0, 0.0, -2.0), scene_folder=scene)
-    assert summary["up"] == (0.0, 0.0, -1.0) and "--up" in summary["up_source"] and "up" not in summary["scale"]
-
-
 @pytest.mark.parametrize("text", ["just words", "", "# a comment", "a: [", "!!python/object:no.such.Thing {}"])
 def test_garbage_config_file(tmp_path, text) -> None:
     (tmp_path / "config.yml").write_text(text)
@@ -371,7 +362,7 @@ def test_scale_from_a_known_distance(small, tmp_path) -> None:
     assert mesh["volume_standard_error"] == pytest.approx(0.03 * mesh["volume"])
 
 
-def test_scale_and_up_from_the_scene_file(small, tmp_path, tmp_path_factory) -> None:
+def test_scale_and_up_from_the_scene_file_unless_up_is_given(small, tmp_path, tmp_path_factory) -> None:
     scene = {"metres_per_unit": 0.5, "metres_per_unit_standard_error": 0.01, "up": [0.0, 2.0, 0.0], "frames": []}
     folder = tmp_path_factory.mktemp("scene")
     (folder / "transforms.json").write_text(json.dumps(scene))
@@ -383,6 +374,8 @@ def test_scale_and_up_from_the_scene_file(small, tmp_path, tmp_path_factory) -> 
     boundary = pyvista.read(tmp_path / "mesh-boundary.vtp")
     up = [str(name) for name in boundary.field_data["patch_names"]].index("exterior-up")
     assert boundary.cell_data["normal"][boundary.cell_data["patch"] == up + 1].mean(axis=0).argmax() == 1
+    given = small(metres_per_unit=None, up=(0.0, 0.0, -2.0), scene_folder=folder)
+    assert given["up"] == (0.0, 0.0, -1.0) and "--up" in given["up_source"] and "up" not in given["scale"]
 
 
 def test_patches_of_the_user_reach_mesh_and_summary(small, tmp_path_factory) -> None:

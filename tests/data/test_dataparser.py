@@ -128,7 +128,12 @@ def test_box_from_cameras_is_where_they_look(scene_folder):
     box = box_of_cameras(frames)
     distance = np.sqrt(17.0)
     np.testing.assert_allclose(box, np.outer([-1, 1], np.full(3, distance * 24 / (1.1 * 24) / 2)), atol=1e-9)
-    torch.testing.assert_close(parse(scene.path).scene_box.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    found = parse(scene.path)
+    torch.testing.assert_close(found.scene_box.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    given = parse(scene.path, scene_box=found.metadata["input_box"])  # the same
+    assert torch.equal(found.scene_box.aabb, given.scene_box.aabb)
+    assert found.dataparser_scale == given.dataparser_scale
+    assert torch.equal(found.dataparser_transform, given.dataparser_transform)
 
 
 def test_other_resolution_gives_scaled_thermal_cameras(scene_folder):
@@ -229,11 +234,15 @@ def in_fahrenheit(scene) -> None:
     write_bounds(15.0, 25.0)(scene)
 
 
-def test_kelvins_that_are_meant_are_read(scene_folder):
+def test_kelvins_that_are_meant_and_a_sky_far_below_the_bounds_are_read(scene_folder):
     scene = scene_folder()
     half_in_kelvin(scene)
     scene.rewrite()
     assert parse(scene.path, thermal_bounds=(10.0, 300.0)).metadata["temperature_range"].max_c == 300.0
+    all_in(".npy", np.eye(18, 24) - 80.0)(scene)
+    write_bounds(10.0, 30.0)(scene)
+    scene.rewrite()
+    assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
 
 
 def test_a_damaged_photograph_or_one_with_an_alpha_channel_is_refused(scene_folder):
@@ -251,12 +260,6 @@ def test_a_damaged_photograph_or_one_with_an_alpha_channel_is_refused(scene_fold
 def bounds_that_are_a_folder(scene) -> None:
     (scene.path / BOUNDS_NAME).unlink()
     (scene.path / BOUNDS_NAME).mkdir()
-
-
-def one_of_another_size(scene) -> None:
-    Image.fromarray(np.arange(12 * 9, dtype=np.uint16).reshape(9, 12)).save(
-        scene.path / "thermal" / "frame_train_003.png"
-    )
 
 
 def all_in(suffix: str, values: np.ndarray):
@@ -296,6 +299,10 @@ def written(text: str):
         scene.rewrite = lambda: (scene.path / "transforms.json").write_text(text)
 
     return change
+
+
+def thermal_of(name: str, counts: np.ndarray):
+    return lambda scene: write_counts(scene.path / "thermal" / f"{name}.png", counts)
 
 
 def content_of(name: str, content: bytes):
@@ -354,7 +361,7 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (mask_all_but_one, "mask_path: .*9 masks for 10 frames"),
         # The remedy names no option: none would help.
         (lambda scene: shutil.rmtree(scene.path / "thermal"), "10 frames, none with one .*Put them in thermal/"),
-        (one_of_another_size, "frame_train_003.*12 x 9"),
+        (thermal_of("frame_train_003", np.eye(9, 12, dtype=np.uint16)), "frame_train_003.*12 x 9"),
         (look_away, "cameras: .*in view"),
         (parallel, "--scene-box"),
         (give_twice, r"frame_train_000\.png more than once"),
@@ -426,22 +433,6 @@ def test_what_has_no_partner_is_left_out_if_one_asks_for_it(scene_folder):
 def test_options_that_cannot_be_are_refused(scene_folder, options):
     with pytest.raises(SceneError, match=list(options)[-1]):
         parse(scene_folder().path, **options)
-
-
-def test_a_box_that_was_found_is_the_same_when_it_is_given(scene_folder):
-    scene = scene_folder(scene_box=None)
-    found = parse(scene.path)
-    given = parse(scene.path, scene_box=found.metadata["input_box"])
-    assert torch.equal(found.scene_box.aabb, given.scene_box.aabb)
-    assert found.dataparser_scale == given.dataparser_scale
-    assert torch.equal(found.dataparser_transform, given.dataparser_transform)
-
-
-def test_a_sky_far_below_the_bounds_is_no_other_unit(scene_folder):
-    scene = scene_folder()
-    all_in(".npy", np.eye(18, 24) - 80.0)(scene)
-    scene.rewrite()
-    assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
 
 
 @pytest.mark.real_data

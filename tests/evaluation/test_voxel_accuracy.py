@@ -7,7 +7,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.evaluation.truth_comparison import KnownTruth, SurfaceScore, mesh_errors, sample_facets
+from thermoxels_ns.evaluation.truth_comparison import KnownTruth, SurfaceScore, mesh_errors
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.synthetic.drawn_scenes import make_scene
 from thermoxels_ns.synthetic.scene_truth import Body
@@ -134,12 +134,3 @@ def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
     assert np.all(mesh.facet_tags == FACET_BOX)
     found = mesh_errors(known(GROUND, np.zeros((1, 3)), from_above()), mesh, 0.1)
     assert set(found) == {"mesh_volume_m3", "mesh_area_m2"}
-
-
-def test_samples_are_spread_by_area_and_lie_on_the_triangles(mesh_of_cells):
-    mesh = mesh_of_cells(np.ones((3, 1, 1), dtype=bool), 1.0)
-    samples = sample_facets(mesh.points_m, mesh.facets, 14_000)
-    at_end = np.abs(samples[:, 0]) < 1e-12
-    assert np.mean(at_end) == pytest.approx(1 / 14, rel=0.03)
-    on_some_face = np.isclose(samples, [0, 0, 0], atol=1e-12) | np.isclose(samples, [3, 1, 1], atol=1e-12)
-    assert on_some_face.any(axis=1).all()

@@ -32,13 +32,13 @@ def filled() -> TetMesh:
     return tagged_body(np.ones((3, 3, 3), dtype=bool), 1.0, outside)
 
 
-def test_rooms_and_walls_are_trusted() -> None:
+@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -3.0, 0.0)])
+def test_a_filled_body_has_no_rooms_and_rooms_and_walls_are_trusted(up) -> None:
+    """What faces down as the mesh was made is a wall if another direction is up."""
     scene = HeatScene(CONCRETE, **AIRS)
-    assert patch_warnings(scene, room(), Z_UP) == () and patch_warnings(scene, wall(), Z_UP) == ()
-
-
-def test_a_filled_body_has_no_rooms() -> None:
-    (warning,) = patch_warnings(HeatScene(CONCRETE, **AIRS), filled(), Z_UP)
+    assert patch_warnings(scene, room(), Z_UP) == patch_warnings(scene, wall(), Z_UP) == ()
+    assert patch_warnings(scene, filled(), up) == ()
+    (warning,) = patch_warnings(scene, filled(), Z_UP)
     assert "of the 9 m² that no photograph saw" in warning and "--interior hollow" in warning and "--patches" in warning
 
 
@@ -48,12 +48,6 @@ def test_a_room_seen_from_within_is_inside_out() -> None:
     assert "faces inwards" in warning and 'patches: ["exterior-*"] to the inside air' in warning
     turned = {name: replace(air, patches=(where,)) for (name, air), where in zip(AIRS.items(), ("ext*", "int*"))}
     assert patch_warnings(HeatScene(CONCRETE, **turned), room(from_within=True), Z_UP) == ()
-
-
-@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -3.0, 0.0)])
-def test_up_decides_what_an_underside_is(up) -> None:
-    """What faces down as the mesh was made is a wall if another direction is up."""
-    assert patch_warnings(HeatScene(CONCRETE, **AIRS), filled(), up) == ()
 
 
 def test_the_rim_of_a_hole_is_no_spot_of_the_inner_surface() -> None:

@@ -4,7 +4,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import room, wall
+from tests.support.heat_bodies import places_on, room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import TimeSteps, values_at
 from thermoxels_ns.fem.selection import Places, Selection
@@ -67,9 +67,8 @@ def test_outside_air(air: OutsideAir, h: float) -> None:
 def test_inside_air_by_orientation(air: InsideAir, ceiling_wall_floor: list[float]) -> None:
     mesh = room()
     (effect,) = effects(mesh, inside_air=air)
-    selection = Selection(mesh)
     for patch, h in zip(("interior-down", "interior-side", "interior-up"), ceiling_wall_floor):
-        places = selection.facet_places(selection.facets((patch,)))
+        places = places_on(mesh, patch)
         assert len(places) == 8 * (4 if patch == "interior-side" else 1)
         np.testing.assert_allclose(values_at(effect.coefficient_w_m2k, places, 0.0), h, rtol=1e-4)
 
@@ -81,8 +80,7 @@ def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
     radiation = {effect.patches: effect for effect in found if isinstance(effect, Radiation)}
     assert set(radiation) == {("exterior-up",), ("exterior-side", "exterior-down")}
     assert radiation[("exterior-up",)].emissivity == 0.2
-    selection = Selection(mesh)
-    places = selection.facet_places(selection.facets(("exterior-side", "exterior-down")))
+    places = places_on(mesh, "exterior-side", "exterior-down")
     around = values_at(radiation[("exterior-side", "exterior-down")].surroundings_c, places, 0.0) + 273.15
     expected = np.where(places.normals[:, 2] < -0.5, 278.15**4, 0.5 * (278.15**4 + 267.15**4)) ** 0.25
     np.testing.assert_allclose(around, expected)
@@ -106,11 +104,9 @@ def test_sunlight_on_surfaces_that_absorb() -> None:
         # Sunlight stays outside although the surface inside has an absorptivity.
         (0.3, ("exterior-side",)),
     ]
-    selection = Selection(mesh)
     for effect, parts in zip(found, ({"exterior-up": 800.0, "exterior-down": 400.0}, {"exterior-side": 200.0})):
         for patch, expected in parts.items():
-            places = selection.facet_places(selection.facets((patch,)))
-            np.testing.assert_allclose(values_at(effect.irradiance_w_m2, places, 0.0), expected)
+            np.testing.assert_allclose(values_at(effect.irradiance_w_m2, places_on(mesh, patch), 0.0), expected)
 
 
 def test_every_patch_is_spoken_of() -> None:

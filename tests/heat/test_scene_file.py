@@ -8,12 +8,12 @@ import pytest
 import yaml
 
 from tests.support.epw_file import write_epw
-from tests.support.heat_bodies import CONCRETE, box_mesh, room
+from tests.support.heat_bodies import CONCRETE, box_mesh, places_on, room
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.forms import ConvectionForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying, values_at
-from thermoxels_ns.fem.selection import Places, Selection
+from thermoxels_ns.fem.selection import Places
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -185,8 +185,7 @@ def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_p
     inside, outside, sky = found.effects(mesh)
     assert isinstance(inside, Convection) and inside.air_c == 20.0
     assert isinstance(outside, Convection) and isinstance(sky, Radiation)
-    selection = Selection(mesh)
-    places = selection.facet_places(selection.facets(("exterior-up",)))
+    places = places_on(mesh, "exterior-up")
     for hours, air_c in ((0.0, -4.0), (1.0, 1.0), (2.0, 6.0), (20.0, 6.0)):
         assert values_at(outside.air_c, places, 3600.0 * hours) == pytest.approx(air_c)
         assert values_at(sky.surroundings_c, places, 3600.0 * hours) == pytest.approx(air_c - 20.0)

@@ -53,26 +53,17 @@ def test_the_five_lines_of_the_docs_on_a_run_that_was_moved(trained: Trained, tm
     assert evaluated.is_file()
 
 
-def lose_partner(scene: Path) -> None:
-    next((scene / "thermal").glob("frame_train_00003*")).unlink()
-
-
-def corrupt_image(scene: Path) -> None:
-    path = next((scene / "images").glob("frame_train_00002*"))
-    path.write_bytes(path.read_bytes()[:400])
-
-
-@pytest.mark.parametrize("damage, word", [(lose_partner, "frame_train_00003"), (corrupt_image, "frame_train_00002")])
-def test_damaged_scene(tiny_scene, tmp_path, damage, word):
+def test_damaged_scene(tiny_scene, tmp_path):
     """What else may be wrong with a scene is tested without a command, in tests/data."""
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
-    damage(scene)
+    path = next((scene / "images").glob("frame_train_00002*"))
+    path.write_bytes(path.read_bytes()[:400])
     said = fail(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path / "out"), *SHORT_TRAINING),
         *("thermal-data", "--data", str(scene)),
     )
-    assert "expected" in said and word in said
+    assert "expected" in said and "frame_train_00002" in said
 
 
 def export(config: Path, output: Path, *options: str) -> str:

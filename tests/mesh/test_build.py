@@ -6,7 +6,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from tests.support.looking_cameras import looking_at
-from tests.support.stuffed_shapes import on_surface
+from tests.support.stuffed_shapes import on_surface, random_turn
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
@@ -26,11 +26,6 @@ VOXEL = "voxel"
 MODES = ["conforming", "voxel"]
 
 
-def rotation(seed: int) -> np.ndarray:
-    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    return turn * np.linalg.det(turn)
-
-
 def linear_map(linear: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
     return np.block([[linear, np.array(shift)[:, None]], [np.zeros(3), 1.0]])
 
@@ -38,7 +33,7 @@ def linear_map(linear: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("mirror", [False, True])
 def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, mirror, mode):
-    linear = rotation(5) @ (np.diag([1.0, 1.0, -1.0]) if mirror else np.eye(3))
+    linear = random_turn(5) @ (np.diag([1.0, 1.0, -1.0]) if mirror else np.eye(3))
     density = np.ones((6, 5, 4))
     density[:3, :3, 2:] = 0.0
     field = snapshot_of(density, lo=(-1.0, 2.0, 0.5), voxel_size=0.25)
@@ -127,8 +122,7 @@ def test_temperatures_come_from_what_was_seen_and_stay_in_its_range(snapshot_of,
 
 @pytest.mark.parametrize("mode", MODES)
 def test_the_area_is_that_of_the_surface_or_of_its_staircase(snapshot_of, mode):
-    turn = rotation(6)
-    mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * turn), mode).mesh
+    mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * random_turn(6)), mode).mesh
     boundary = mesh.boundary
     assert boundary.seen.all()  # without cameras nothing is known to be hidden
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide

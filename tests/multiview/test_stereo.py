@@ -106,15 +106,17 @@ def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
     assert depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0)).share == 0.0  # behind all cameras
 
 
+CLOSE = [(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)]
+ROW, COLUMN = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
+
+
 def plate(noise: float) -> tuple[Photographs, np.ndarray]:
     """Photographs of a part of the plane before a plain, far background, and which pixels show the plane."""
-    eyes = [(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)]
-    seen = photographs(eyes)
-    colours = np.empty((len(eyes), SIZE, SIZE, 3))
+    seen = photographs(CLOSE)
+    colours = np.empty((len(CLOSE), SIZE, SIZE, 3))
     shown = np.zeros(colours.shape[:3], dtype=bool)
-    row, column = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
-    for number, eye in enumerate(eyes):
-        x, y = eye[0] + column * TRUE_DEPTH, eye[1] - row * TRUE_DEPTH
+    for number, eye in enumerate(CLOSE):
+        x, y = eye[0] + COLUMN * TRUE_DEPTH, eye[1] - ROW * TRUE_DEPTH
         shown[number] = (np.abs(x) < 0.4) & (np.abs(y) < 0.4)
         colours[number] = 0.35 + 0.1 * texture(3.0 * x, 3.0 * y)  # weak and fine, and clearly not what is behind
     colours[~shown] = 0.9 + np.random.default_rng(0).normal(0.0, noise, (int((~shown).sum()), 3))
@@ -134,13 +136,12 @@ def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
 @pytest.mark.parametrize(("liars", "sure"), [(4, False), (9, True)])
 def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars, sure):
     """Some photographs agree about a plate before the plane, which all others look through."""
-    seen = photographs([(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)])
-    row, column = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
+    seen = photographs(CLOSE)
 
     def sweep(view, near, *span):
         depth = np.full((SIZE, SIZE), TRUE_DEPTH, np.float32)
         if np.flatnonzero((seen.centres == view.centre).all(1))[0] < liars:
-            x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (column, row)))
+            x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (COLUMN, ROW)))
             depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
         return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32)
 

@@ -149,8 +149,7 @@ class Truth:
 def true_draws(conditions: Conditions, seed: int | None) -> Draws:
     """True values of what the conditions state, drawn from their ranges; None: as stated."""
     if seed is None:
-        stated = draw(conditions, 1)
-        return Draws({name: values[:1] for name, values in stated.values.items()})
+        return draw(conditions, 1).first(0)
     return Draws({name: values[1:] for name, values in draw(conditions, 1, 1000 + seed).values.items()})
 
 

@@ -126,8 +126,6 @@ class FlirFile:
         put(0x58, "3f", self.planck["r1"], self.planck["b"], self.planck["f"])
         put(0x70, "5f", 0.006569, 0.01262, -0.002276, -0.00667, 1.9)
         record[0xD4:0xDD] = b"FLIR T999"
-        record[0x104:0x108] = b"1234"
-        record[0x170:0x175] = b"FOL25"
         put(0x1B4, "f", 24.5)
         put(0x308, "if", int(self.planck["o"]), self.planck["r2"])
         put(0x310, "HH", *self.raw_range)

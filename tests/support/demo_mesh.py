@@ -35,9 +35,11 @@ def demo_mesh(scene_name: str, voxels: int, boundary: BoundaryMode = "conforming
     scene = make_scene(scene_name)
     lattice = Lattice.covering(*scene.scene_box, voxels)
     temperature_c = scene.surface_temperature_c(lattice.corner_positions().reshape(-1, 3)).reshape(lattice.shape)
-    snapshot = exact_snapshot(scene.solid.signed_distance, lattice, temperature_c)
-    selection = SolidSelection(density_threshold=1.0, close_gaps=0)
-    return build_mesh(snapshot, selection, np.eye(4), boundary).mesh
+    return _mesh(exact_snapshot(scene.solid.signed_distance, lattice, temperature_c), boundary)
+
+
+def _mesh(snapshot: GridSnapshot, boundary: BoundaryMode = "conforming") -> TetMesh:
+    return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4), boundary).mesh
 
 
 TURN = np.radians(30.0)
@@ -66,13 +68,14 @@ def gable_house() -> TetMesh:
     def distance(points):
         return np.minimum(np.maximum(walls(points @ TURNED), roof(points @ TURNED)), ground(points))
 
-    return _mesh(distance, (-6.5, -6.5, -1.0), (6.5, 6.5, 6.5))
+    return _mesh(exact_snapshot(distance, Lattice.covering((-6.5, -6.5, -1.0), (6.5, 6.5, 6.5), 56)))
 
 
 def angled_house() -> TetMesh:
     """An L of two boxes: 10 m x 5 m, 6 m high, and 4 m x 4.5 m, 3.5 m high; no ground."""
     parts = _box((-5, -2.5, 0), (5, 2.5, 6)), _box((1, -2.5, 0), (5, 7, 3.5))
-    return _mesh(lambda points: np.minimum(*(part(points) for part in parts)), (-6, -4, -1), (6, 8, 7))
+    lattice = Lattice.covering((-6, -4, -1), (6, 8, 7), 56)
+    return _mesh(exact_snapshot(lambda points: np.minimum(*(part(points) for part in parts)), lattice))
 
 
 @cache
@@ -90,9 +93,3 @@ def house_corner(voxels: int = 64) -> TetMesh:
         observed=np.ones(len(mesh.points_m), dtype=bool),
         colour=np.asarray(scene.colour(mesh.points_m, normals), dtype=np.float32),
     )
-
-
-def _mesh(distance, low, high) -> TetMesh:
-    snapshot = exact_snapshot(distance, Lattice.covering(low, high, 56))
-    selection = SolidSelection(density_threshold=1.0, close_gaps=0)
-    return build_mesh(snapshot, selection, np.eye(4)).mesh

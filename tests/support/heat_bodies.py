@@ -14,7 +14,7 @@ from skfem import BilinearForm
 from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.linear_tets import lumped_mass, refine_mesh, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, Varying
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
@@ -258,6 +258,12 @@ def tagged_body(cells: np.ndarray, voxel_m: float, outside: np.ndarray, cut_belo
     cut = np.where(middle[:, 0] < cut_below_x, FACET_BOX, mesh.facet_tags)
     tagged, _ = with_patches(replace(mesh, facet_tags=cut), PatchRules(), Z_UP, outside[tuple(beyond.T)])
     return replace(tagged, region_names=("solid", "slab"), facet_tags=mesh.facet_tags)
+
+
+def places_on(mesh: TetMesh, *patches: str) -> Places:
+    """Where the boundary triangles of some patches are."""
+    selection = Selection(mesh)
+    return selection.facet_places(selection.facets(patches))
 
 
 def room(from_within: bool = False) -> TetMesh:

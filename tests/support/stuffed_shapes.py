@@ -51,6 +51,12 @@ def turn(degrees: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def random_turn(seed: int) -> np.ndarray:
+    """A rotation about an axis in any direction."""
+    axes = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return axes * np.linalg.det(axes)
+
+
 def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
     beyond = np.abs(points) - half
     return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.heat_bodies import COLDEST_C, LISTED_W, box_mesh, building_corner, graded, planes
+from tests.support.stuffed_shapes import random_turn
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
@@ -48,9 +49,7 @@ def test_case_1_half_a_square_column(seed) -> None:
     mesh = box_mesh(np.linspace(0, 0.5, 25), [0, 1 / 48], np.linspace(0, 1, 49), temperature_c=5.0)
     turn, away, number = np.eye(3), np.zeros(3), np.arange(len(mesh.points_m))
     if seed is not None:
-        rng = np.random.default_rng(seed)
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        turn *= np.sign(np.linalg.det(turn))
+        rng, turn = np.random.default_rng(seed), random_turn(seed)
         away, number = rng.uniform(-50.0, 50.0, 3), rng.permutation(number)
 
     def sides(places, time_s):

@@ -47,13 +47,9 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
     radius = 10.3
     distance = np.linalg.norm((LATTICE.cell_centres() - MIDDLE) / H, axis=-1) - radius
     cells, camera = distance < 0.0, MIDDLE + np.array([12.0, 3.0, -2.0])
-    points = kuhn_tets(cells)[0]
-    facets = boundary_facets(kuhn_tets(cells)[1])
-    centroids = LATTICE.index_to_world(points[facets].mean(axis=1))
-    normals = (centroids - MIDDLE) / np.linalg.norm(centroids - MIDDLE, axis=1, keepdims=True)
-    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
-
+    centroids, _ = voxel_surface(cells)
     outward = (centroids - MIDDLE) / np.linalg.norm(centroids - MIDDLE, axis=1, keepdims=True)
+    seen = seen_facets(cells, views(camera), LATTICE, centroids, outward)
     towards = camera - MIDDLE - radius * H * outward
     elevation = np.degrees(np.arcsin(np.einsum("ij,ij->i", outward, towards) / np.linalg.norm(towards, axis=1)))
     assert np.count_nonzero(elevation > 12.0) > 1000

@@ -6,7 +6,7 @@ import pytest
 from scipy import sparse
 
 from tests.support.heat_bodies import mesh_from
-from tests.support.stuffed_shapes import stiffness
+from tests.support.stuffed_shapes import random_turn, stiffness
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_sides
 from thermoxels_ns.mesh.temperature import tet_conductances
@@ -102,9 +102,7 @@ def test_edges_where_a_boundary_touches_itself_are_counted(mesh_of_cells, depth,
 @pytest.mark.parametrize("shift_m", [(0.0, 0.0, 0.0), (450_000.3, 5_200_000.4, 300.0)])
 def test_angles_of_voxels_are_right_in_national_coordinates_too(box_mesh, shift_m):
     """Five million metres from the origin nodes have steps of a nanometre."""
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    figures = check_mesh(replace(box_mesh, points_m=0.05 * box_mesh.points_m @ turn.T + shift_m))
+    figures = check_mesh(replace(box_mesh, points_m=0.05 * box_mesh.points_m @ random_turn(1).T + shift_m))
     assert figures.dihedral_range_deg == pytest.approx((45.0, 90.0), abs=1e-4)
 
 

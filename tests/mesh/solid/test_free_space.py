@@ -15,6 +15,7 @@ from thermoxels_ns.mesh.solid.free_space import (
 )
 
 LATTICE = Lattice((-1.0, -1.0, -1.0), 0.125, (17, 17, 17))
+EMPTY = np.zeros(LATTICE.cell_shape, dtype=bool)
 
 
 def crossings(cells: np.ndarray, eye: np.ndarray, along: np.ndarray, wider: float = 0.0) -> tuple[np.ndarray, ...]:
@@ -77,10 +78,9 @@ def test_counts_are_those_of_straight_lines_of_sight(eye):
 
 
 def test_every_voxel_is_counted_once_by_a_camera_on_a_diagonal_of_the_lattice():
-    empty = np.zeros(LATTICE.cell_shape, dtype=bool)
     for eye in ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0), (0.07, 0.07, 0.07), (-3.0, 0.0, 3.0)):
         target = (0.5, 0.0, 0.0) if not any(eye) else (0.0, 0.0, 0.0)
-        counts = count_cameras(empty, LATTICE, looking_at(target, eye, focal=1.0, size=2000))
+        counts = count_cameras(EMPTY, LATTICE, looking_at(target, eye, focal=1.0, size=2000))
         to_voxel, ahead = LATTICE.cell_centres() - eye, np.asarray(target) - eye
         cosine = to_voxel @ ahead / (np.linalg.norm(to_voxel, axis=-1) * np.linalg.norm(ahead))
         assert (counts.in_image[cosine > 0.2] == 1).all() and (counts.in_image[cosine < -0.2] == 0).all(), eye
@@ -89,8 +89,7 @@ def test_every_voxel_is_counted_once_by_a_camera_on_a_diagonal_of_the_lattice():
 
 
 def test_what_no_image_holds_is_neither_seen_nor_hidden():
-    empty = np.zeros(LATTICE.cell_shape, dtype=bool)
-    counts = count_cameras(empty, LATTICE, looking_at((0, 0, 0), (3.0, 0, 0), focal=2000.0))
+    counts = count_cameras(EMPTY, LATTICE, looking_at((0, 0, 0), (3.0, 0, 0), focal=2000.0))
     outside = counts.in_image == 0
     assert outside.mean() > 0.5 and not (counts.seen | counts.hidden)[outside].any() and counts.seen[~outside].all()
 
@@ -115,7 +114,7 @@ def test_one_camera_in_ten_must_see_a_voxel():
 
 def test_many_cameras_are_thinned_out():
     eyes = np.column_stack((np.full(300, 3.0), np.linspace(-1, 1, 300), np.zeros(300)))
-    counts = count_cameras(np.zeros(LATTICE.cell_shape, dtype=bool), LATTICE, looking_at((0, 0, 0), eyes, focal=30.0))
+    counts = count_cameras(EMPTY, LATTICE, looking_at((0, 0, 0), eyes, focal=30.0))
     assert (counts.in_image == MOST_CAMERAS).all() and (counts.free == MOST_CAMERAS).all()
 
 

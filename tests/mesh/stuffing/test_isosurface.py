@@ -12,6 +12,7 @@ from tests.support.stuffed_shapes import (
     euler_characteristic,
     num_bodies,
     on_surface,
+    random_turn,
     tet_mesh,
     turn,
 )
@@ -222,13 +223,8 @@ SHIFT = np.array([0.0137, -0.0071, 0.0043])
 """Where the middle of `stuffed_shapes.Shape` is not."""
 
 
-def turned(seed: int) -> np.ndarray:
-    axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return axes * np.linalg.det(axes)
-
-
 def turned_box(half: tuple[float, float, float], seed: int) -> Shape:
-    rotation, (a, b, c) = turned(seed), half
+    rotation, (a, b, c) = random_turn(seed), half
     return Shape(lambda p: box_distance(p @ rotation, np.array(half)), 8 * a * b * c, 8 * (a * b + b * c + a * c))
 
 
@@ -283,7 +279,7 @@ def test_boxes_at_any_angle(seed, noise):
 
 def test_concave_edges_as_well():
     """An L in cross section: five convex edges along it and a concave one."""
-    rotation = turned(5)
+    rotation = random_turn(5)
 
     def distance(p: np.ndarray) -> np.ndarray:
         q = p @ rotation
@@ -348,7 +344,7 @@ def test_what_lies_on_the_border_stays_there():
 def test_edges_that_face_each_other_do_not_cross(seed):
     """Two bars, edge to edge, less than two voxels apart."""
     random = np.random.default_rng(seed)
-    axes, half = turned(seed), np.array([0.25, 0.25, 0.25])
+    axes, half = random_turn(seed), np.array([0.25, 0.25, 0.25])
     away = random.uniform(0.3, 0.8) * VOXEL + 0.25 * np.sqrt(2.0)
     middle = np.array([away, random.uniform(-0.05, 0.05), 0.03])
 
