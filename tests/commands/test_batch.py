@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -32,6 +33,19 @@ while [ $# -gt 0 ]; do
 done
 exit 0
 """
+
+
+CLUSTER = {  # Stands for SLURM: sbatch runs what it is given on this machine and keeps the job's status for sacct.
+    "sbatch": """jobs="$(dirname "$0")/jobs"; mkdir -p "$jobs"; id=$(ls "$jobs" | wc -l)1
+echo RUNNING >"$jobs/$id"; echo "$*" >>"$jobs.log"
+for word in "$@"; do case "$word" in --wrap=*) what="${word#--wrap=}" ;; esac; done
+( sh -c "${what:-$(cat)}" && echo COMPLETED >"$jobs/$id" || echo FAILED >"$jobs/$id" ) >"$jobs.out" 2>&1 &
+echo $id""",
+    "sacct": """cd "$(dirname "$0")/jobs" 2>/dev/null && for id in *; do echo "$id|$(cat $id)"; done""",
+    "srun": """while [ "${1#-}" != "$1" ]; do shift; done; exec "$@\"""",
+    "sinfo": "echo PARTITION; echo all",
+    **dict.fromkeys(("scancel", "squeue", "scontrol", "sacctmgr", "sshare"), "exit 0"),
+}
 
 
 @pytest.fixture
@@ -150,6 +164,29 @@ def test_a_dry_run_says_what_each_stage_asks_for(tmp_path, commands):
         assert said.count(f"rule {stage}:") == 2, said
     assert f"mem_mb={STAGES['model'].memory_mb}" in said and "runtime=" in said
     assert not (out / "one").exists() and not (out / "index.html").exists()
+
+
+@needs_snakemake
+@pytest.mark.skipif(
+    find_spec("snakemake_executor_plugin_slurm") is None,
+    reason="Snakemake's plugin is not installed: pip install 'snakemake-executor-plugin-slurm<2.6'",
+)
+def test_stages_are_handed_to_a_cluster(tmp_path, commands):
+    folder, environment = commands
+    for name, does in CLUSTER.items():
+        (folder / name).write_text(f"#!/bin/sh\n{does}\n")
+        (folder / name).chmod(0o755)
+    (tmp_path / "config.yaml").write_text("slurm-init-seconds-before-status-checks: 2\n")
+    environment |= {"PATH": f"{folder}:{os.environ['PATH']}", "SNAKEMAKE_PROFILE": str(tmp_path), "USER": "auditor"}
+    path, out = listed(tmp_path, hungry="train=3", wrong="train=2"), tmp_path / "out"
+    said, _ = (run := started(commands, path, "--output-dir", out, "--executor", "slurm")).communicate(timeout=400)
+    assert run.returncode == 2 and "1 finished, 1 not" in (out / "index.html").read_text(), said
+    asked = (folder / "jobs.log").read_text()
+    for attempt in (1, 2):  # what ran out of memory asks for twice as much
+        asks = f"-t {attempt * STAGES['model'].minutes} --mem {attempt * STAGES['model'].memory_mb} "
+        assert re.search(f"rule_model_wildcards_hungry .*{asks}.*--cpus-per-task={STAGES['model'].threads} ", asked), (
+            asked
+        )
 
 
 def test_what_is_not_asked_for_is_no_stage():
