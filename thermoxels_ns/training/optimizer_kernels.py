@@ -1,4 +1,4 @@
-"""Compiled row updates of the optimisers on a CPU; `optimizers` has the same updates in plain PyTorch."""
+"""The compiled row updates of Adam on a CPU; `optimizers` has the same updates in plain PyTorch."""
 
 from __future__ import annotations
 
@@ -38,15 +38,3 @@ def adam_rows(
             m[k] = b1 * m[k] + c1 * g[k]
             v[k] = b2 * v[k] + c2 * g[k] * g[k]
             at[k] -= rate * m[k] / (np.sqrt(v[k] * share) + tiny)
-
-
-@kernel
-def rmsprop_rows(begin: int, end: int, rows, gradient, values, square, lr, alpha, eps):
-    """Take one step of RMSprop on `values` and `square` (mean of squares) at ``rows[begin:end]``; see `adam_rows`."""
-    one = values.dtype.type
-    keep, take, rate, tiny = one(alpha), one(1.0 - alpha), one(lr), one(eps)
-    for n in range(begin, end):
-        at, mean, g = values[rows[n]], square[rows[n]], gradient[n]
-        for k in range(at.shape[0]):
-            mean[k] = keep * mean[k] + take * g[k] * g[k]
-            at[k] -= rate * g[k] / (np.sqrt(mean[k]) + tiny)

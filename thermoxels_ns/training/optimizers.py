@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -25,12 +24,8 @@ class RowOptimizer(torch.optim.Optimizer):
     """
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Update all parameters once and return the loss of `closure`, or None without a closure."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Update all parameters once. There is no `closure`, a function that computes the loss again."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is None:
@@ -41,7 +36,6 @@ class RowOptimizer(torch.optim.Optimizer):
                     state.update(self.new_state(parameter))
                 if len(rows):
                     self.update_rows(parameter.view(len(parameter), -1), rows, values, state, group)
-        return loss
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
         """Return the state of a parameter before its first update: tensors by name with one entry per row."""
@@ -128,13 +122,6 @@ class RowRMSprop(RowOptimizer):
         """Take one step of RMSprop on the given rows; see `RowOptimizer.update_rows`."""
         lr, alpha, eps = group["lr"], group["alpha"], group["eps"]
         square = state["square_avg"].view(len(parameter), -1)
-        if parameter.device.type == "cpu":
-            from thermoxels_ns.training.optimizer_kernels import rmsprop_rows
-
-            arrays = [t.detach().contiguous().numpy() for t in (rows, gradient)]
-            held = [t.detach().numpy() for t in (parameter, square)]
-            run_ranges(lambda a, b: rmsprop_rows(a, b, *arrays, *held, lr, alpha, eps), len(rows), 2048)
-            return
         mean = alpha * square[rows] + (1 - alpha) * gradient * gradient
         square[rows] = mean
         parameter[rows] -= lr * gradient / (mean.sqrt() + eps)
