@@ -31,12 +31,12 @@ class Camera:
     fl_y: float
     cx: float
     cy: float
-    k1: float = 0.0  # Radial distortion of second order (coefficient of r^2), as in OpenCV
-    k2: float = 0.0  # Fourth order
+    k1: float = 0.0  # Radial distortion, coefficient of r^2, as in OpenCV
+    k2: float = 0.0  # Coefficient of r^4
     p1: float = 0.0  # Tangential distortion, as in OpenCV
     p2: float = 0.0  # Tangential distortion, as in OpenCV
-    k3: float = 0.0  # Sixth order
-    k4: float = 0.0  # Eighth order
+    k3: float = 0.0  # Coefficient of r^6
+    k4: float = 0.0  # Coefficient of r^8
 
     def __post_init__(self) -> None:
         numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)
@@ -49,7 +49,9 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
-        """Return a camera with square pixels, its principal point at the centre, and this horizontal angle of view.
+        """Return a camera with square pixels, its principal point at the image centre, and this angle of view.
+
+        Raises `SceneError` unless the angle is above 0 and below 179 degrees.
 
         >>> round(Camera.from_field_of_view(640, 480, 90.0).fl_x, 6)
         320.0
@@ -63,11 +65,11 @@ class Camera:
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float, float]:
-        """Distortion k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
+        """Distortion coefficients k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
         return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
 
     def entries(self) -> dict[str, Any]:
-        """Return size and lens by their names in transforms.json; k3 and k4 are left out."""
+        """Return image size and lens as entries of transforms.json; k3 and k4 are left out."""
         names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
         lens = {name: getattr(self, name) for name in names}
         return {"camera_model": "OPENCV", "w": self.width, "h": self.height, **lens}
@@ -79,7 +81,7 @@ class Camera:
         return replace(self, width=width, height=height, **lengths)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the same camera with `factor` times as many pixels along each side, rounded down."""
+        """Return the same camera with `factor` times as many pixels along each side, rounded down to at least 1."""
         width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
         lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
         return replace(self, width=width, height=height, **lengths)
@@ -108,10 +110,8 @@ class Camera:
         return np.column_stack([plane, np.ones(len(plane))])
 
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
-        """Return unit ray directions in the world through a grid of points in every pixel; distortion is ignored.
-
-        `pose` is camera to world, shape (3, 4) or (4, 4). The result has shape (height, width, samples_per_axis^2, 3).
-        """
+        """Return unit ray directions in world axes through a regular grid of points in each pixel. Distortion is
+        ignored. The result has shape (height, width, samples_per_axis^2, 3)."""
         s = samples_per_axis
         x = (np.arange(self.width * s) + 0.5) / s
         y = (np.arange(self.height * s) + 0.5) / s
@@ -125,7 +125,8 @@ class Camera:
         return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
 
     def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge; False for NaN."""
+        """Return whether each of the pixels (n, 2) lies in the image, `border` or more pixels from its edge; (n,). NaN
+        lies outside."""
         x, y = np.asarray(pixels, dtype=np.float64).T
         return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
 

@@ -43,7 +43,8 @@ def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsE
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
     """Raise `ThermoxelsError` if the value of an option is out of range or NaN.
 
-    `values` maps names to (value, least, largest, range in words); messages put `prefix`, such as "--", before them.
+    `values` maps the name of an option to (value, least and largest value allowed, range in words). The message tells
+    the user to correct the option, whose name it writes behind `prefix`, such as "--".
     """
     for name, (value, low, high, expected) in values.items():
         if not (is_number(value) and low <= value <= high):  # NaN fails too
@@ -60,7 +61,7 @@ def check_array(
 ) -> npt.NDArray:
     """Return `array` if every entry is finite and its shape matches `shape`, else raise `error`.
 
-    None as a length matches any length, None as `shape` any shape.
+    A length None in `shape` matches any length. If `shape` is None, the array may have any shape.
     """
     if shape is not None and (
         len(array.shape) != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape))
@@ -76,7 +77,7 @@ def check_array(
 def check_direction(
     name: str, vector: npt.ArrayLike, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
 ) -> FloatArray:
-    """Return `vector`, shape (3,), made 1 long; raise `error` if a number is not finite or all are 0."""
+    """Return `vector` scaled to length 1; raise `error` unless it has three finite numbers that are not all 0."""
     array = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0
     if not (math.isfinite(length) and length > 0.0):
@@ -92,9 +93,10 @@ def plain_os_errors(
     error: type[ThermoxelsError] = OutputError,
     always_what: bool = False,
 ) -> Iterator[None]:
-    """Turn an OSError of a with block into `error` about `what`, or if the system names a file about that file.
+    """Replace an OSError that a with block raises by `error`; a `ThermoxelsError` passes unchanged.
 
-    With `always_what` the error is about `what` in any case, such as where the system names a temporary file.
+    The message is about the file that the system names, or about `what` if the system names none. If `always_what` is
+    True, the message is always about `what`: the system may name a temporary file, of which the user knows nothing.
     """
     try:
         yield
@@ -130,7 +132,8 @@ def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
     """Lock `file` in an output folder and return the lock; raise `OutputError` if another process has locked `file`.
 
-    The system releases the lock when the process ends in any way. On a drive without locks, `say` receives a warning.
+    The error advises `remedy`. The system releases the lock when the process ends in any way. On a drive without locks
+    nothing is locked, and `say` receives a warning.
     """
     lock = FileLock(file)
     try:
@@ -153,8 +156,8 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
-    The temporary name keeps the suffix, by which writers choose their format; what a killed process left under it is
-    overwritten. Raises `OutputError` if the block or the renaming ends in an error of the operating system.
+    The temporary path has the suffix of `path`, because writers choose their format by it. A file that a killed process
+    left at the temporary path is overwritten. Raises `OutputError` if the block or the renaming raises an OSError.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.part{final.suffix}")
@@ -171,7 +174,8 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays by name to a compressed .npz file, whole or not at all; raises `OutputError` if that fails.
 
-    They are packed in memory: an archive that numpy could not write to a full disk raises again when it is deleted.
+    The file is packed in memory first. If numpy wrote to a full disk instead, its archive object would raise a second
+    error when it is deleted.
     """
     packed = io.BytesIO()
     np.savez_compressed(packed, **arrays)
@@ -187,7 +191,7 @@ def remove_file(path: Path | str) -> None:
 
 
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
-    """Raise `OutputError` if a folder has the name of one of `files`, or a file the name of one of `folders`."""
+    """Raise `OutputError` if one of `files` in `folder` is a folder, or if one of `folders` in it is a file."""
     blocked = [name for name in files if (folder / name).is_dir()]
     blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
     if blocked:
@@ -197,15 +201,14 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 
 
 def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
-    """Make and return the folder of a command's results.
+    """Make the folder of a command's results, if needed, and return it.
 
-    Raises `OutputError` if something is in the way of the results, or if the command would replace or remove files that
-    it did not write.
+    Raises `OutputError` if a folder has the name of a result, or if results are there but `first` is not.
 
     Args:
         files: Names of all files in the folder `path` that the command may write.
-        first: Name of the file that a run writes first. Without it, the command wrote none of `files`.
-        series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None if the command writes no such files.
+        first: Name of the file that a run writes first. If it is missing, someone else wrote the other files.
+        series: Pattern of result files in a subfolder, such as ``heat/step-*.vtu``; None: there are none.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])

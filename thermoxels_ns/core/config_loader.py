@@ -1,4 +1,4 @@
-"""nerfstudio's config.yml read without running code from the file, its command line, and changed modules."""
+"""Reading of nerfstudio's config.yml without running code from it, typed options, and stand-ins for modules."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ _HARMLESS_TAGS = {
 
 
 class ConfigLoader(yaml.Loader):
-    """Loader of the config.yml that ``ns-train`` writes, which refuses entries that could run code.
+    """Yaml loader for the config.yml that ``ns-train`` writes; it refuses entries that could run code.
 
-    The file may make configuration dataclasses, enumerations and paths, and may name classes, of nerfstudio and of
-    packages installed as its plugins. The whole file is checked before any object is made.
+    The file may make paths, and dataclasses and enumerations of nerfstudio, of this package and of other installed
+    plugins of nerfstudio. It may name classes of the same packages and of torch.optim. The whole file is checked before
+    any object is made.
     """
 
     run_folder: ClassVar[Path | None] = None
-    """Folder of the config.yml that is loaded next, to which the run may have been moved; None: not known."""
+    """Folder in which the config.yml that is loaded next lies now, perhaps after a move of the run; None: unknown."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Return the next node of the file, or raise `CheckpointError` with a forbidden name and its line."""
+        """Return the next yaml node; raise `CheckpointError`, with tag and line, for a tag that could run code."""
         node = super().compose_node(parent, index)
         tag = "" if node is None else node.tag.removeprefix(_PYTHON_TAG)
         if node is not None and node.tag != tag and not _harmless(tag):
@@ -47,7 +48,8 @@ class ConfigLoader(yaml.Loader):
         return node
 
     def get_single_data(self) -> Any:
-        """Return the content of the file; raise `CheckpointError` if it cannot be read safely."""
+        """Return the content of the file; raise `CheckpointError` if a tag could run code or nesting is too deep. If
+        `run_folder` is set and the content has a method ``moved_to``, the method is called with that folder."""
         folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None  # also if what follows fails
         try:
             node = self.get_single_node()
@@ -62,7 +64,7 @@ class ConfigLoader(yaml.Loader):
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Loader that imports nothing: objects become mappings of their fields, paths lists of their parts, names None."""
+    """Loader that imports nothing: it makes objects mappings of fields, paths lists of parts, and names None."""
 
 
 def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
@@ -75,10 +77,10 @@ _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 
 
 def check_run(config: Path) -> dict[str, Any]:
-    """Return the content of a run's config.yml as `_PlainLoader` reads it; nerfstudio is not imported.
+    """Return the content of a run's config.yml as mappings, lists and plain values; nerfstudio is not imported.
 
-    Raises `CheckpointError` if the file, a checkpoint or the photographs are missing; a run of another method needs the
-    file alone. `ConfigLoader` then takes the folder of `config` as that of the run, which may have been moved.
+    Raises `CheckpointError` if the file cannot be read, or if the run has no checkpoint or its scene is missing. For a
+    run of another method, only the file is checked. Otherwise `ConfigLoader.run_folder` is set to the file's folder.
     """
     got, remedy = "no such file", "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
     content: Any = None
@@ -108,13 +110,13 @@ def check_run(config: Path) -> dict[str, Any]:
 
 
 def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
-    """Return the path of a run's scene: `from_run`, as seen from its folder, if something is there, else `told`."""
+    """Return the path of a run's scene: `from_run` relative to the run's `folder` if it exists, else `told`."""
     beside = Path(os.path.normpath(folder / from_run))
     return beside if from_run and beside.exists() else told
 
 
 def _harmless(tag: str) -> bool:
-    """Return whether a tag ``kind:name`` makes plain data, or names a class that a configuration may contain."""
+    """Return whether a Python tag ``kind:name`` makes plain data or an object that `ConfigLoader` allows."""
     kind, _, name = tag.partition(":")
     if not name or tag in _HARMLESS_TAGS:
         return True
@@ -132,7 +134,7 @@ def _harmless(tag: str) -> bool:
 
 
 def _plugin_packages() -> set[str]:
-    """Return names of packages: nerfstudio, ours, and plugins by metadata or nerfstudio's environment variables."""
+    """Return nerfstudio, this package, and plugins named by package metadata or nerfstudio's environment variables."""
     groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
     values = [entry.value for group in groups for entry in entry_points(group=group)]
     for name in ("NERFSTUDIO_METHOD_CONFIGS", "NERFSTUDIO_DATAPARSER_CONFIGS"):
@@ -147,7 +149,7 @@ def typed(option: str) -> bool:
 
 
 def typed_value(option: str) -> str | None:
-    """Return the last value of an option (as "--max-rays") on this process's command line; None if there is none."""
+    """Return the last value of an option, such as "--max-rays", on this process's command line; None without one."""
     found = None
     for word, following in zip(sys.argv[1:], [*sys.argv[2:], None]):
         name, equals, value = word.partition("=")
@@ -157,7 +159,7 @@ def typed_value(option: str) -> str | None:
 
 
 class ModuleWith(ModuleType):
-    """A stand-in for `module`: names in `replaced` have the values given there, all others those of `module`."""
+    """A stand-in for `module`: a name in `replaced` has the value given there, any other its value in `module`."""
 
     def __init__(self, module: ModuleType, **replaced: Any) -> None:
         super().__init__(module.__name__, doc=module.__doc__)

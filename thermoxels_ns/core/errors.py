@@ -3,12 +3,12 @@
 import unicodedata
 
 BAD_DATA, LACK_OF_MEMORY, CRASH = 2, 3, 1
-"""Exit statuses of commands: their input or options are wrong; memory does not suffice; an error of the program."""
+"""Exit statuses of commands: wrong input or options; too little memory; an error in the program."""
 _UNPRINTED = ("Cc", "Cs")  # categories of control characters, which break lines or terminals, and undecodable bytes
 
 
 class ThermoxelsError(Exception):
-    """Base of all errors caused by the input. `what` names the wrong entry, or, without `expected`, is the message."""
+    """Base of all errors caused by the input. `what` names the wrong entry; without `expected`, it is the message."""
 
     def __init__(self, what: str, *, expected: str | None = None, got: object = None, remedy: str = "") -> None:
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))
@@ -59,7 +59,7 @@ class OutputError(ThermoxelsError, OSError):
 
 
 def exit_status(problem: BaseException) -> int:
-    """Return the exit status of a command that ends with an error; of a step that failed, that of the step."""
+    """Return the exit status of a command that ends with `problem`; for a failed step, the exit status of the step."""
     if isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError":  # torch's
         return LACK_OF_MEMORY
     if hasattr(problem, "exit_status"):  # of a command that failed

@@ -13,10 +13,10 @@ RGB_STREAM = 1  # The ray carries a colour target
 THERMAL_STREAM = 2  # The ray carries a temperature target
 
 MARGIN_VOXELS, MARGIN_ERRORS = 1.5, 2.0
-"""A surface is at a point, and the air before it ends, within so many voxels plus so many standard errors of the length
-of a ray to the point: in the loss of feature rays, in votes on air, and where photographs support a surface."""
-NEIGHBOURS = 8  # Points nearest to a point in a photograph with which the point's distance is compared
-FEWEST_NEIGHBOURS = 4  # A photograph with fewer neighbours of a point does not judge the point
+"""Margin around the point of a feature ray: so many voxels plus so many standard errors of the ray's length. Within it
+the air may end and the surface may lie: in the loss of feature rays, in votes on air, in the support of surfaces."""
+NEIGHBOURS = 8  # Number of nearest points in a photograph with which the distance of a point is compared
+FEWEST_NEIGHBOURS = 4  # A photograph with fewer neighbours of a point cannot contradict the point
 STEEPEST = 3.0  # Largest slope of a surface against the photograph at which points on it agree: 72 degrees
 LEAST_TOLERANCE = 0.01  # Share of the distance by which neighbours may differ at any slope: surfaces are rough
 TOLERANCE_ERRORS = 3.0  # Standard errors of a ray's length by which neighbours may differ at any slope
@@ -25,7 +25,7 @@ _RAYS_AT_ONCE = 1 << 18  # Rays whose neighbours are sought at once, to limit me
 
 @dataclass(frozen=True, eq=False)
 class FeatureRays:
-    """Rays from camera centres to points on which photographs agree, in world units; rays pass through air only."""
+    """Rays from camera centres to points on which photographs agree, [world units]; there is only air between them."""
 
     origins: FloatArray  # Camera centre of each ray, shape (s, 3)
     point: IntArray  # Index into `points` of each ray, ascending, shape (s,)
@@ -49,13 +49,14 @@ class FeatureRays:
 
 
 def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
-    """Return which points, (n,), are about as far from the cameras as their neighbours; wrong matches rarely are.
+    """Return for each point, (n,), whether it is about as far from the cameras as its neighbours in photographs are.
 
-    A photograph is all rays of one origin. A point's neighbours are the `NEIGHBOURS` points seen nearest to the point
-    in a photograph. The photograph vouches for the point if it shows fewer than `FEWEST_NEIGHBOURS`, or if at least
-    half of them differ in distance by at most the largest of: `STEEPEST` times their distance across the ray, the share
-    `LEAST_TOLERANCE` of the distance, `TOLERANCE_ERRORS` standard errors. A point is True if at least half of its
-    photographs vouch for it, or if it has no rays. A point on a thin thing in front of other things may be False.
+    Wrong matches rarely are. All rays of one origin form a photograph. The neighbours of a point in a photograph are
+    the `NEIGHBOURS` points whose directions are nearest. A neighbour agrees if its distance differs by at most the
+    largest of: `STEEPEST` times its distance across the ray, the share `LEAST_TOLERANCE` of the point's distance,
+    `TOLERANCE_ERRORS` standard errors. A photograph vouches for the point if at least half of the neighbours agree, or
+    if there are fewer than `FEWEST_NEIGHBOURS`. The result is True if at least half of the photographs vouch for the
+    point, or if it has no rays. It may be False for a right point on a thin thing in front of other things.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 

@@ -19,7 +19,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] = ThermoxelsError) -> Any:
     """Return `value` with all dataclasses, mappings, arrays, tuples and paths in it converted to types that json knows.
 
-    Raises `error` for NaN, infinity or any other type; the message says where in `name` the bad value stands.
+    Raises `error` for NaN, infinity and values of other types; the message begins with `name` and the value's place.
 
     >>> plain_values({"sizes": (1, 2.5), "file": Path("a.npy")})
     {'sizes': [1, 2.5], 'file': 'a.npy'}
@@ -56,7 +56,10 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Return the content of a json file; raises `error` if it is missing or damaged, or an object has a key twice."""
+    """Return the content of a json file; raises `error` if the file is missing or damaged or repeats a key.
+
+    `expected` and `remedy` are parts of the message about a missing or damaged file.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:
@@ -66,7 +69,7 @@ def read_json(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of json, or raise ValueError for a key that occurs twice; json alone would drop the first."""
+    """Return the pairs of a json object as a dictionary; raise ValueError for a key that occurs twice."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)

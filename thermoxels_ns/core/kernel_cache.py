@@ -16,11 +16,11 @@ _DIGEST = "thermoxels-kernels.sha256"
 
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
-    """Decorate a function so that numba compiles it at its first call, caches it on disk, and releases Python's lock.
+    """Decorate a function so that numba compiles it at its first call and caches the machine code on disk.
 
-    A kernel may use kernels and constants of its own room (subpackage) and of ``core``. As numba watches only the
-    kernel's own file, all compiled kernels of a room are removed when any file of the room or of ``core`` has changed.
-    Plain use is ``@kernel``; `options` are those of `numba.njit`, such as
+    A kernel runs without Python's global lock. It may use kernels and constants of its own room (subpackage) and of
+    ``core``. Because numba watches only the kernel's own file, all compiled kernels of a room are removed when any file
+    of the room or of ``core`` has changed. Plain use is ``@kernel``; `options` are those of `numba.njit`, such as
     ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
     """
     import numba
@@ -44,9 +44,9 @@ def _forget_once(room: str, cached: Path) -> None:
 
 
 def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:
-    """Remove compiled kernels from a folder of numba's cache if any of `sources` has changed since the last call.
+    """Remove the compiled kernels in the folder `cached` if any of `sources` has changed since the last call.
 
-    Return whether any has changed. Return False for a folder that cannot be written.
+    Return True if they were removed; False if no source has changed, or if the folder cannot be written.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()
     mark = cached / _DIGEST

@@ -23,7 +23,7 @@ class Lattice:
     """A regular lattice of cubic voxels with values on their corners.
 
     Corner (i, j, k) is at ``lo + (i, j, k) * voxel_size``; N corners along an axis span N - 1 voxels. The flat index of
-    a corner is ``(i * ny + j) * nz + k`` (C order); that of a cell (a voxel) follows the same rule with `cell_shape`.
+    a corner is ``(i * ny + j) * nz + k`` (C order). The flat index of a cell (a voxel) is the same with `cell_shape`.
     """
 
     lo: tuple[float, float, float]  # World position of corner (0, 0, 0)
@@ -38,7 +38,8 @@ class Lattice:
     def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:
         """Return the lattice that covers a box with `resolution` voxels along its longest side.
 
-        Each other side gets as many voxels as cover it, and both of its ends exceed the box by the same length.
+        A shorter side gets the fewest voxels that cover it, which exceed the box by the same length at both ends.
+        Raises `ThermoxelsError` unless all sides are finite and above 0 and `resolution` is at least 1.
 
         >>> Lattice.covering((0, 0, 0), (2, 1, 0.9), 4)
         Lattice(lo=(0.0, 0.0, -0.05), voxel_size=0.5, shape=(5, 3, 3))
@@ -104,7 +105,9 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
-    """Return the matrix (4, 4) from world to input points if p_world = scale * (R p_input + t), `transform` [R | t].
+    """Return the matrix (4, 4) that maps world points to input points: the inverse of p = scale * (R p_input + t).
+
+    `transform` is [R | t], (3, 4). Raises `CheckpointError` unless R is orthonormal and `scale` is above 0.
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

@@ -46,7 +46,7 @@ _EXAMPLES = {"1": "0.93 +- 0.02", "C": "20.0 +- 0.5 C", "K": "0 +- 1 K"}
 
 @dataclass(frozen=True)
 class Measured:
-    """A measured number with the half width of the range around it in which every true value is equally likely."""
+    """A measured number, and the half width of the range around it; all values in the range are equally likely."""
 
     value: float
     off_by: float = 0.0  # Half width of the range, at least 0; 0: the value is taken as exact
@@ -73,8 +73,8 @@ class Unit:
     above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Return `content`, a `Measured`, its fields, or what `read_measured` can read, in this unit. Raises
-        ValueError, made from a `ThermoxelsError` without a name, if it cannot be read or is not within the limits."""
+        """Return `content` as a `Measured` in this unit; raise ValueError if it is unreadable or out of the limits.
+        `content` is a `Measured` in this unit, a dictionary of its two fields, or an argument of `read_measured`."""
         try:
             if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
                 value, off_by = content["value"], content["off_by"]
@@ -103,8 +103,9 @@ class Unit:
 def read_measured(name: str, content: object, unit: str, bare: bool = False) -> Measured:
     """Read a value as people write it, such as ``20.0 +- 0.5 C`` or ``0.93``; return it in `unit`, "1" for no unit.
 
-    A comma counts as a decimal point, unless three digits follow. With `bare` a number without a unit is in `unit`.
-    Raises `ThermoxelsError`, which starts with `name`, if the text is no number or its unit is wrong or missing.
+    A comma counts as a decimal point. If `bare` is True, a number without a unit is taken to be in `unit`. Raises
+    `ThermoxelsError`, which starts with `name`, if the text is no number, if its unit is wrong or missing, or if a
+    comma may be one of thousands, as in "1,500".
 
     >>> read_measured("wind", "3,6 +- 1.8 km/h", "m/s")
     Measured(value=1.0, off_by=0.5)

@@ -31,23 +31,21 @@ class Views:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], poses: Sequence[FloatArray]) -> Views:
-        """Return the views of cameras, without their distortion, whose poses are (3, 4) or (4, 4), see above.
-
-        Where a lens distorts, a view may end a little inside or outside the border of the photograph.
-        """
+        """Return the views of `cameras` at `poses`, (3, 4) or (4, 4) each, camera to world (OpenGL). Distortion is left
+        out, so that a view may end a little inside or outside the border of the photograph."""
         pairs = (("fl_x", "fl_y"), ("cx", "cy"), ("width", "height"))
         parts = (np.array([[getattr(camera, name) for name in pair] for camera in cameras]) for pair in pairs)
         return cls(np.stack([pose[:3] for pose in poses]), *parts)
 
     def matrices(self) -> FloatArray:
-        """Return matrices, (c, 3, 4), from points (x, y, z, 1) to depth * (column, row, 1), with depth > 0 ahead."""
+        """Return the projection matrices (c, 3, 4) from (x, y, z, 1) to depth * (column, row, 1); depth > 0 ahead."""
         turned = self.camera_to_world[:, :, :3].transpose(0, 2, 1) * [[1.0], [-1.0], [-1.0]]
         local = np.concatenate((turned, -turned @ self.camera_to_world[:, :, 3:]), axis=2)
         local[:, :2] = self.focal[..., None] * local[:, :2] + self.centre[..., None] * local[:, 2:]
         return local
 
     def shows(self, camera: int, directions: FloatArray) -> BoolArray:
-        """Return which directions (..., 3) from a camera's centre lie in its image, shape (...)."""
+        """Return for each direction (..., 3) from the centre of a camera whether it lies in the image, shape (...)."""
         local = directions @ self.camera_to_world[camera, :, :3]
         depth = -local[..., 2]
         ahead = depth > 1e-9
@@ -57,13 +55,13 @@ class Views:
         return ahead & (x >= 0) & (x <= self.size[camera, 0]) & (y >= 0) & (y <= self.size[camera, 1])
 
     def shown_well(self, places: FloatArray, reach: FloatArray) -> BoolArray:
-        """Return which places (n, 3) photographs show about as well as what the cameras were pointed at, (n,).
+        """Return for each place (n, 3) whether photographs show it about as well as the cameras' targets, (n,).
 
-        Each camera adds 1 to the visibility of all places in its image up to the distance `reach` of what it was
-        pointed at, and (reach / distance)^2 beyond, in proportion to the pixels per area; occlusion is ignored. A place
-        is shown well if its visibility is at least `SHOWN_WELL` of that of the places which nearly all cameras were
-        pointed at. Open ground then ends about where the cameras stood. Cameras whose `reach` (cameras,) is NaN do not
-        count; if none counts, all places are shown well.
+        `reach` (cameras,) is the distance of each camera's target, the point that it was pointed at; a camera with NaN
+        does not count. A camera adds 1 to the visibility of each place in its image up to the distance `reach`, and
+        (reach / distance)^2 beyond, in proportion to the pixels per area. Occlusion is ignored. A place is shown well
+        if its visibility is at least `SHOWN_WELL` times the quantile `_FEWEST_CAMERAS` of the targets' visibilities.
+        Open ground then ends about where the cameras stood. If no camera counts, all places are shown well.
         """
         (known,) = np.nonzero(np.isfinite(reach))
         eyes, axes = self.camera_to_world[:, :, 3], self.camera_to_world[:, :, 2]
@@ -83,17 +81,16 @@ class Views:
 
 @dataclass(frozen=True)
 class RayEvidence:
-    """Evidence from training rays, colour and thermal alike, of where solid is."""
+    """Evidence from training rays of both streams about where solid matter is."""
 
     voxel_weight: Float32Array
-    """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
+    """Sum of the weights of the samples in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: Float32Array
     """For each ray whose opacity exceeds 1/2, the highest density at the centres of the voxels that the ray crosses
     within half a voxel of the point at which half of its weight is spent, shape (rays,), [1 / world unit]."""
     ends: Float32Array
-    """Where these rays end: the points at which half of their weight is spent, in corner indices of the lattice, shape
-    (rays, 3)."""
-    directions: Float32Array  # Unit vectors of these rays, shape (rays, 3)
+    """Points at which half of the weight of these rays is spent, in corner indices of the lattice, shape (rays, 3)."""
+    directions: Float32Array  # Unit vectors along these rays, shape (rays, 3)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Results as tables: a dictionary of plain values for each line, or a pandas frame."""
+"""Results as tables: lists of rows, each a dictionary from column name to plain value, or pandas frames."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 
 class HasTables(ABC):
-    """Results with tables by name; the first is "patches"."""
+    """Base of results that have named tables; the first table is "patches"."""
 
     @abstractmethod
     def tables(self) -> Mapping[str, list[dict[str, Any]]]:
-        """Return all tables by name; a table is a list of lines, a line a dictionary from column to plain value."""
+        """Return all tables by name; a table is a list of rows, a row a dictionary from column name to plain value."""
 
     def to_frame(self, table: str = "patches") -> Any:
-        """Return a table as a pandas DataFrame; raise `ThermoxelsError` without such a table, or without pandas."""
+        """Return a table as a pandas DataFrame; raise `ThermoxelsError` if the name is unknown or pandas is missing."""
         tables = self.tables()
         if table not in tables:
             expected = f"one of {', '.join(tables)}"
@@ -33,9 +33,10 @@ class HasTables(ABC):
 
 
 def lines_of(records: Iterable[object]) -> list[dict[str, Any]]:
-    """Return each dataclass as a line of a table; what lies in a dataclass or mapping in it gets the name of its field.
+    """Return one row of a table, a dictionary from column name to value, for each dataclass instance in `records`.
 
-    A field `value` of such a dataclass, as an interval has, becomes the column of the field itself.
+    If a field holds a dataclass or a mapping, each of its entries becomes a column ``field_entry``. An entry ``value``,
+    as an interval has, becomes the column ``field``.
     """
     return [dict(_columns(record, "")) for record in records]
 

@@ -35,8 +35,9 @@ def _executor() -> ThreadPoolExecutor:
 def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 64) -> list[object]:
     """Call ``work(first, last)`` in parallel on ranges (last excluded) that cover 0 to `total`; return all results.
 
-    Results are in the order of the ranges. `work` must release Python's lock and write to places of its own range, so
-    that the number of threads never changes a result. Ranges have at least `smallest` items, but for the last.
+    Results are in the order of the ranges. Each range has at least `smallest` items, except the last range. To run in
+    parallel, `work` must release Python's global lock. To give the same result with any number of threads, it must
+    write only to places of its own range.
     """
     threads = num_threads()
     if threads == 1 or total <= smallest:

@@ -37,7 +37,7 @@ def kelvin_to_celsius(temperature_k: Numbers) -> Numbers:
 
 @dataclass(frozen=True)
 class TemperatureRange:
-    """The range of a scene's temperatures, by which temperatures are normalised. Raises `ThermoxelsError` if empty."""
+    """The temperatures that are normalised to 0 and 1. Raises `ThermoxelsError` if less than 0.001 K apart."""
 
     min_c: float  # Temperature with the normalised value 0, [degrees Celsius]
     max_c: float  # Temperature with the normalised value 1, [degrees Celsius]

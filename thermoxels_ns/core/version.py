@@ -1,3 +1,3 @@
-"""The version of this package, apart from the root, which imports what asks for it."""
+"""The version of this package, in a module of its own because the package root imports modules that need it."""
 
 __version__ = "0.1.0"

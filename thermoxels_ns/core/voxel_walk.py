@@ -9,9 +9,9 @@ from thermoxels_ns.core.kernel_cache import kernel
 
 @kernel
 def cells_crossed(origin, direction, longest, shape, cells, faces):
-    """Fill `cells` with the voxels that a ray crosses, in order, and return their number (Amanatides and Woo 1987).
+    """Write the voxels that a ray crosses, in order, to `cells` and return their number (Amanatides and Woo 1987).
 
-    Coordinates are corner indices, lengths are in voxels.
+    Coordinates are corner indices; lengths are in voxels.
 
     Args:
         origin: Start of the ray, inside or outside the lattice, shape (3,).

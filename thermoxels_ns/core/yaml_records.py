@@ -50,7 +50,7 @@ def configs_folder() -> Path:
 
 
 def write_example(path: Path, example: str, error: type[ThermoxelsError]) -> None:
-    """Copy a file of `configs_folder` to `path`; raises `error` if there is something already."""
+    """Copy the file `example` of `configs_folder` to `path`; raises `error` if `path` exists."""
     if path.exists():
         remedy = "Choose another name."
         raise error(str(path), expected="a name that is free", got="a file", remedy=remedy)
@@ -61,7 +61,7 @@ def write_example(path: Path, example: str, error: type[ThermoxelsError]) -> Non
 
 @contextmanager
 def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
-    """Turn a `ThermoxelsError` of a with block or decorated function into `error`, with `before` before its text."""
+    """Replace a `ThermoxelsError` of a with block or decorated function by an `error` with the text `before` + text."""
     try:
         yield
     except ThermoxelsError as problem:
@@ -69,7 +69,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a yaml file; raises `ThermoxelsError` if the file is missing or empty or repeats a key."""
+    """Return the mapping in a yaml file; raises `RecordError` if it is missing, damaged or empty, or repeats a key."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
@@ -85,7 +85,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> RecordError:
-    """Return an error about file or entry `name`: it should be `expected` but is `got`; `remedy` says what to do."""
+    """Return a `RecordError` which says that the file or entry `name` should be `expected` but is `got`."""
     return RecordError(name, expected=expected, got=got, remedy=remedy)
 
 
@@ -96,9 +96,10 @@ def shown(content: object) -> str:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record]]:
-    """Return a decorator that makes a frozen dataclass with values checked by type; one `error` lists all mistakes.
+    """Return a decorator that makes a class a frozen dataclass whose constructor checks its arguments by their types.
 
-    A class may check several fields together in ``__post_init__`` by raising an error of ours that is a ValueError.
+    The constructor raises one `error` that lists all mistakes. A class may check several fields together in
+    ``__post_init__``, which must then raise a `ThermoxelsError` that is also a ValueError, such as `RecordError`.
     """
     from pydantic import ValidationError
     from pydantic.dataclasses import dataclass
@@ -147,7 +148,9 @@ def _config(infinite: bool = False) -> ConfigDict:
 
 
 def _report(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
-    """Return one line per mistake, at most `_MOST_TOLD`; `positional` names fields that may be given in order."""
+    """Return one line of text for each mistake in `problem`, at most `_MOST_TOLD`. `name` is the source of `content`,
+    which should have the type `target`. `positional` names the fields of a class in their order if `content` is the
+    arguments of its constructor; None: `content` is from a file."""
     found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
     for one in problem.errors(include_url=False):
         place, at, path, chosen = one["loc"], content, list[str | int](), False
@@ -171,7 +174,7 @@ def _report(name: str, problem: ValidationError, target: Any, content: Any, posi
 
 
 def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any], target: Any) -> str:
-    """Return our message for one of pydantic's errors, about `value` at `path` in `name`."""
+    """Return our message for pydantic's error `one`, about `value` at the keys `path` of the source `name`."""
     kind, where, above = one["type"], _where(name, path), _where(name, path[:-1]) or target.__name__
     if kind == "value_error":
         return ": ".join(filter(None, (printable(where), str(one["ctx"]["error"]).removeprefix(": "))))
@@ -205,7 +208,7 @@ def _where(name: str, path: list[str | int]) -> str:
 
 
 def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
-    """Return the keys of all dataclasses to which a path of keys leads from the type `hint`."""
+    """Return the field names of the dataclasses that the keys `path` lead to from the type `hint`."""
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         if not path:
             return tuple(field.name for field in dataclasses.fields(hint) if field.init)
@@ -215,7 +218,7 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Loader that raises `ConstructorError` for a key that is no text, or twice in a mapping (yaml keeps the last)."""
+    """Loader that raises `ConstructorError` for a key that is not text, or that a mapping has twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set[str]()

@@ -28,7 +28,7 @@ def num_coefficients(degree: int) -> int:
 
 
 def degree_of(coefficients: int) -> int:
-    """Return the degree that has `coefficients` harmonics up to it; the inverse of `num_coefficients`.
+    """Return the highest degree of a set of `coefficients` harmonics; the inverse of `num_coefficients`.
 
     >>> degree_of(9)
     2
@@ -53,5 +53,5 @@ def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n
 
 
 def harmonics_with_unit_mean(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """Return `harmonics` scaled so that the first is 1; a sum's first coefficient is then its mean over directions."""
+    """Return `harmonics` / Y00: the first harmonic is 1, so a sum's first coefficient is its mean over directions."""
     return harmonics(directions, degree) / _Y00

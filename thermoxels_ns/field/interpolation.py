@@ -14,16 +14,16 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 @dataclass(frozen=True)
 class TrilinearPoints:
-    """The places of points in a lattice: the voxel of each point, and the place of the point in its voxel."""
+    """Places of points in a lattice: for each point the number of its voxel and its coordinates in the voxel."""
 
     voxels: KeptVoxels
     number: Int64[Tensor, " n"]
-    """Number of the kept voxel in which each point lies; -1 where the voxel is not kept: such a point has no values."""
+    """Number of the kept voxel in which each point lies; -1: the voxel is not kept, so the point has no values."""
     fraction: Float[Tensor, "n 3"]  # Place in the voxel, each coordinate from 0 to 1
 
     @classmethod
     def of(cls, voxels: KeptVoxels, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
-        """Find the voxels of world positions; a point outside the lattice is moved to the nearest point of its box."""
+        """Return the places of world positions; a point outside the lattice is moved to the nearest point inside."""
         lattice = voxels.lattice
         lo = torch.tensor(lattice.lo, dtype=points.dtype, device=points.device)
         cells = torch.tensor(lattice.cell_shape, dtype=points.dtype, device=points.device)
@@ -36,13 +36,13 @@ class TrilinearPoints:
         return self.number >= 0
 
     def weights(self) -> Float[Tensor, "n 8"]:
-        """Return the trilinear weights of the corners (see `CORNER_OFFSETS`) of each point's voxel, which sum to 1."""
+        """Return the trilinear weights of the corners of each point's voxel, in order of `CORNER_OFFSETS`; sum 1."""
         (x, y, z), (u, v, w) = self.fraction.unbind(-1), (1 - self.fraction).unbind(-1)
         face = torch.stack((v * w, v * z, y * w, y * z), -1)
         return torch.cat((face * u[:, None], face * x[:, None]), -1)
 
     def rows(self) -> Int64[Tensor, "n 8"]:
-        """Return the row numbers of the voxel's corners in the order of `CORNER_OFFSETS`; for points in kept voxels."""
+        """Return the rows of the corners of each point's voxel, which must be kept, in order of `CORNER_OFFSETS`."""
         return self.voxels.tables(self.number.device)[0][self.number]
 
     def select(self, chosen: Tensor | slice) -> TrilinearPoints:
@@ -51,15 +51,19 @@ class TrilinearPoints:
 
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
-    """Return values at points in kept voxels: the sum over the voxel's corners c of their weight w_c times rows[c].
+    """Return interpolated values at points: the sum over the corners c of a point's voxel of weight w_c times rows[c].
 
-    The gradient for `rows` is summed in the order of the points, so its bits do not depend on the number of threads.
+    All points must lie in kept voxels. The gradient with respect to `rows` is summed in the order of the points: no bit
+    of it depends on the number of threads.
     """
     return _Interpolate.apply(rows, at)  # type: ignore[return-value]
 
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
-    """Return for each corner's row the sum of `values` of points times the corner's trilinear weight at the point."""
+    """Return for each row the sum over points of `values` times the trilinear weight of the row's corner at the point.
+
+    This is the transpose of `interpolate`. All points must lie in kept voxels.
+    """
     total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total

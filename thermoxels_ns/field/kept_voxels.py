@@ -86,16 +86,14 @@ class KeptVoxels:
         return np.stack(np.unravel_index(self.corners, self.lattice.shape), axis=1)
 
     def dilated(self, chosen: BoolArray, by: int) -> BoolArray:
-        """Return which kept voxels lie within `by` voxels, along each axis, of the chosen ones; one boolean per voxel.
-
-        `chosen` has one boolean per kept voxel too. Distances count across voxels that are not kept.
-        """
+        """Return for each kept voxel whether a chosen one is at most `by` voxels away along every axis, (voxels,).
+        `chosen` (voxels,) has one boolean per kept voxel too. The way between may lead through voxels not kept."""
         grown = np.zeros(self.lattice.cell_shape, dtype=bool)
         grown.reshape(-1)[self.cells[chosen]] = True
         return np.asarray(maximum_filter(grown, 2 * by + 1, mode="constant"), dtype=bool).reshape(-1)[self.cells]
 
     def tables(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Return int64 tensors on `device`: rows of all eight corners (voxels, 8), `block_slot` and `voxel_number`."""
+        """Return int64 tensors on `device`: rows of the eight corners (voxels, 8), `block_slot`, `voxel_number`."""
         if device not in self._tables:
             four = torch.from_numpy(self.voxel_rows).to(device, torch.int64)
             eight = torch.stack((four, four + 1), dim=-1).flatten(1)  # order of CORNER_OFFSETS
@@ -133,7 +131,7 @@ class MemoryNeed:
 
 
 def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
-    """Predict the memory of training on `voxels` kept voxels of a lattice, with `channels` numbers per corner.
+    """Return the predicted memory for training on `voxels` kept voxels of a lattice with `channels` numbers per corner.
 
     Each channel of a corner takes a value, two moments of the optimiser and a gradient, each of four bytes.
     """

@@ -15,12 +15,13 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 GridChange = Callable[[Tensor], Tensor]
-"""A function from values before a change, (old rows, old columns), to values after it, (new rows, new columns)."""
+"""A function that maps values of a grid's rows before a change to values after it, both (rows, columns); it applies to
+a parameter and to an optimiser's state of this parameter."""
 ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once, which limits the memory for corner numbers and weights
 
 
 def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
-    """Return the voxels of the refined lattice into which the kept voxels split: `factor`^3 for each."""
+    """Return the kept voxels of the lattice that is refined by `factor`: `factor`^3 for each voxel of `voxels`."""
     fine = voxels.lattice.refined(factor)
     index = np.unravel_index(voxels.cells, voxels.lattice.cell_shape)
     first = np.ravel_multi_index(tuple(along * factor for along in index), fine.cell_shape)
@@ -31,7 +32,7 @@ def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
 
 
 def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> TrilinearPoints:
-    """Return where the corners of the split voxels `new` lie in the voxels `old`, in the order of the new rows."""
+    """Return the places in the voxels `old` of the corners of ``new = split_voxels(old, factor)``, one per new row."""
     index = new.corner_index()
     number = torch.full((len(index),), -1, dtype=torch.int64)
     fraction = torch.zeros(len(index), 3, dtype=torch.float64)
@@ -55,7 +56,7 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
 def refine(grid: VoxelGrid, factor: int = 2) -> GridChange:
     """Split every kept voxel of `grid` into factor^3, in place; return the interpolation from old rows to new rows.
 
-    The field stays as it is: new corners get interpolated raw values, and corners of before keep their exact values.
+    The field does not change: new corners get interpolated raw values, and old corners keep their exact values.
     """
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
@@ -74,7 +75,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> GridChange:
 
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: BoolArray) -> GridChange:
-    """Drop voxels of `grid` where `keep` (voxels,) is False, in place; return the function that picks the rows kept."""
+    """Drop the voxels of `grid` that are False in `keep` (voxels,), in place; return the selection of the rows left."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: IntArray = np.searchsorted(voxels.corners, new.corners)
@@ -88,9 +89,10 @@ def prune(grid: VoxelGrid, keep: BoolArray) -> GridChange:
 
 @torch.no_grad()
 def widen_colour(grid: VoxelGrid, degree: int) -> GridChange:
-    """Let `grid` store colour up to a higher degree, in place; return the function that adds columns of zeros.
+    """Raise the degree of the colour harmonics of `grid`, in place; return the function that adds columns of zeros.
 
-    The field stays as it is, because harmonics with coefficient 0 add nothing. One number per row stays as it is.
+    `degree` must be above the stored degree. The field does not change, because harmonics with coefficient 0 add
+    nothing. The returned function does not change values with one column, such as numbers of updates.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
     few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)

@@ -19,25 +19,30 @@ from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight pieces of rays in lattice coordinates of `Surroundings`, ray after ray and from near to far."""
+    """Straight pieces of rays in lattice coordinates of `Surroundings`, ray after ray, each ray from near to far."""
 
     ray: Int64[Tensor, " n"]  # Ray to which each piece belongs
     rank: Int64[Tensor, " n"]  # 0 for the first piece of a ray, 1 for the next
     origins: Float[Tensor, "n 3"]  # Begin of each piece
     directions: Float[Tensor, "n 3"]  # Unit vectors
-    lengths: Float[Tensor, " n"]  # Lattice units
+    lengths: Float[Tensor, " n"]  # In lattice units
 
 
 class Surroundings(nn.Module):
     """Density, colour and temperature from the faces of the box to infinity.
 
-    A frustum reaches from each face to infinity. Scale the box to -1 to 1 and let q be the coordinate across the face
-    (1 on the face), p and r those along it. In the coordinates 1/q, p/q and r/q the frustum is a box, infinity is its
-    far side 1/q = 0, and straight lines stay straight. The six boxes stand in one lattice, one behind the other with
-    an empty layer of voxels between, so that the renderers of a grid can render them.
+    A frustum reaches from each face to infinity. Scale the box to -1 to 1. Let q be the coordinate perpendicular to the
+    face (1 on the face), and p and r the coordinates along it. In the coordinates 1/q, p/q and r/q the frustum is a
+    box, infinity is its far side 1/q = 0, and straight lines stay straight. The six boxes stand in one lattice, one
+    behind the other along x with an empty layer of voxels between, so that the renderers of a grid can render them.
 
-    `box` (2, 3) is in world units. At the start a face is `across` voxels wide and infinity lies `deep` voxels away;
-    densities are per edge of such a voxel. `start_density`, `activation`: see `VoxelGrid`; `colour`: False: no colour.
+    Args:
+        box: Lower and upper corner, [world units].
+        across: Width of a face at the start, [voxels].
+        deep: Number of voxels from a face to infinity at the start.
+        start_density: Density at the start, as all densities per edge of a voxel at the start; see `VoxelGrid`.
+        activation: See `VoxelGrid`.
+        colour: False: no colour is stored.
     """
 
     centre: Tensor  # Middle of the box, (3,), world units
@@ -71,10 +76,10 @@ class Surroundings(nn.Module):
     def segments(
         self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"] | None = None
     ) -> Segments:
-        """Cut rays, from where they leave the box to `far` (None: infinity), into straight pieces, one per frustum.
+        """Return the straight pieces, one per frustum, of rays from the point at which they leave the box to `far`.
 
-        Rays and `far` are in world units. A ray that misses the box begins where it is nearest to the box's middle, so
-        that the space before a camera outside the box stays empty.
+        Rays and distances `far` are in world units; None: infinity. A ray that misses the box begins at its point
+        nearest to the box's middle, so that the space before a camera outside the box is empty.
         """
         from thermoxels_ns.field.surroundings_kernels import MOST_SEGMENTS, cut_rays
 

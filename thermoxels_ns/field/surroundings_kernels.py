@@ -13,8 +13,15 @@ MOST_SEGMENTS = 6  # Most frusta through which a ray can pass
 def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
     """Cut rays into straight pieces, one per frustum of `Surroundings`, and return the number of pieces.
 
-    Writes the two ends of each piece in lattice coordinates into `ends` (n, 2, 3), its ray and its rank into `ray` and
-    `rank` (n,). Origins `at` and directions `along` (rays, 3) are scaled so that the box is -1 to 1; `reaches`: ends.
+    Args:
+        at: Origins of the rays in coordinates in which the box is -1 to 1, (rays, 3).
+        along: Directions per world unit in these coordinates, (rays, 3).
+        reaches: Distance at which each ray ends, (rays,), [world units]; may be infinite.
+        across: `Surroundings.across`.
+        deep: `Surroundings.deep`.
+        ends: Receives the two ends of each piece in lattice coordinates, (n, 2, 3), n >= `MOST_SEGMENTS` times rays.
+        ray: Receives the ray of each piece, (n,).
+        rank: Receives the number of each piece along its ray, from 0, (n,).
     """
     count = 0
     for r in range(len(at)):
@@ -61,7 +68,7 @@ def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
 
 @kernel
 def _begin(at, along):
-    """Return the distance, at least 0, where a ray leaves the box -1 to 1, or, for a miss, is nearest to its middle."""
+    """Return the distance, at least 0, at which a ray leaves the box -1 to 1; if it misses, that nearest to 0, 0, 0."""
     enter, leave, across, square = -np.inf, np.inf, 0.0, 0.0
     for i in range(3):
         step = along[i] if abs(along[i]) > 1e-12 else 1e-12

@@ -47,8 +47,9 @@ def raw_density(density: float, kind: DensityActivation) -> float:
 class VoxelGrid(nn.Module):
     """The parameters of the field: density, colour and temperature, one row per corner of a kept voxel.
 
-    Refinement and pruning make new parameters, because autograd remembers the shape of a leaf; the caller must point
-    the optimisers to these. Loading a checkpoint exchanges only the data, so that existing optimisers stay valid.
+    Refinement and pruning make new parameter objects, because autograd remembers the shape of a leaf. The caller must
+    then pass these objects to the optimisers. Loading a checkpoint exchanges only the data of the parameters, so that
+    existing optimisers remain valid.
 
     Args:
         lattice: Lattice at the start; all its voxels are kept.
@@ -108,7 +109,7 @@ class VoxelGrid(nn.Module):
 
     @torch.no_grad()
     def paint(self, colours: Float[Tensor, "rows 3"]) -> None:
-        """Set the colour of each row, in [0, 1], the same from all directions."""
+        """Set the colour of each row, in [0, 1], the same from all directions; the grid must store colour."""
         assert self.sh is not None
         constant = harmonics(self.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
         by_channel = self.sh.view(len(self.sh), 3, -1)
@@ -116,9 +117,11 @@ class VoxelGrid(nn.Module):
         by_channel[..., 0] = torch.logit(colours.to(self.sh), _PALEST) / constant
 
     def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
-        """Set the kept voxels, of this lattice or another, and the new rows of each parameter by name.
+        """Replace the kept voxels by `voxels`, of this lattice or another, and the values of the parameters by `rows`.
 
-        `keep_identity`: keep the parameter objects and exchange their data, only while no autograd graph uses them.
+        `rows` must have a tensor (voxels.num_rows, columns) for each name of `row_parameters`. By default the
+        parameters become new objects. If `keep_identity` is True, the objects remain and only their data are
+        exchanged; the caller must then make sure that no autograd graph uses them.
         """
         for name, parameter in self.row_parameters().items():
             data = rows[name].to(parameter.device, parameter.dtype).contiguous()
@@ -131,7 +134,7 @@ class VoxelGrid(nn.Module):
             setattr(self, name, values.to(self.lo.device))
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
-        """Set kept voxels and degree of colour to the checkpoint's, then load its parameters."""
+        """Take kept voxels and degree of colour from the checkpoint, if it has valid ones, then load its parameters."""
         names = ("lo", "voxel_size", "corner_shape", "cells")
         if all(prefix + name in state_dict for name in (*names, *self.row_parameters())):
             lo, size, shape, cells = (state_dict[prefix + name] for name in names)
@@ -156,7 +159,8 @@ class VoxelGrid(nn.Module):
         return activate_density(interpolate(self.density, at)[:, 0], self.activation)
 
     def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return the colour, in [0, 1], of points in kept voxels seen along unit directions; the grid needs colour."""
+        """Return the colour, in [0, 1], of points in kept voxels seen along unit directions. The grid must store
+        colour."""
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
         basis = harmonics(directions, self.sh_degree)[:, None]
         coefficients = interpolate(self.sh, at).view(len(directions), 3, basis.shape[-1])
@@ -193,7 +197,7 @@ class VoxelGrid(nn.Module):
 
 
 def _described(voxels: KeptVoxels) -> dict[str, Tensor]:
-    """Return the buffers by which a checkpoint describes the lattice and its kept voxels."""
+    """Return the buffers, by name, with which a checkpoint describes the lattice and its kept voxels."""
     lattice = voxels.lattice
     return {
         "lo": torch.tensor(lattice.lo, dtype=torch.float64),

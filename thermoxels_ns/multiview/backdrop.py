@@ -1,4 +1,4 @@
-"""Search for pixels of photographs that show a plain backdrop: a sky, the wall behind an object."""
+"""Search for pixels of photographs that show a plain backdrop (a sky, the wall behind an object) or a ceiling."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 
-PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels around
+PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels beside it
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which no side of a photograph is its top
 LEVEL = 10.0  # Weight, in `upwards`, of one image axis being level against that of the other being steep
 TOLERANCE = 0.1
@@ -18,26 +18,25 @@ TOLERANCE = 0.1
 eight drawn scenes and a real street, 0.06 for colours finds less of the sky (saharov32: 54 % instead of 69 %); neither
 value takes more than 1 % of a body's pixels."""
 RISE_DEG, SURROUNDED = 10.0, 0.02
-"""Cameras stand inside what they photograph if, for half of them, this share of all points of known depth lies behind
-the camera and so many degrees above it. The share is 0.07 in a drawn living room, 0.003 around a statue in a street, 0
-around drawn houses."""
-COLDER = 0.05  # A sky is colder than all pixels of known depth but this share
-_SOME = 20_000  # About as many pixels are used for a statistic
+"""Cameras stand inside what they photograph if, for half of them, at least the share `SURROUNDED` of all points of
+known depth lies behind the camera and at least `RISE_DEG` degrees above it. The share is 0.07 in a drawn living room,
+0.003 around a statue in a street, 0 around drawn houses."""
+COLDER = 0.05  # A sky is colder than this quantile of the temperatures of pixels with a known depth
+_SOME = 20_000  # A statistic uses about as many pixels
 _WIDEST, _ROUNDS = 0.3, 8
-"""Tolerance of the first of so many fits of the backdrop's colour; it shrinks to `TOLERANCE` in the last."""
+"""Tolerance in the first fit of the backdrop's colour, and number of fits; in the last it is `TOLERANCE`."""
 
 
 def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return three masks (pixels,): the plain backdrop, pixels at its outline with wrong depths, and a plain ceiling.
 
-    Under a sky there is no ceiling; in a room there is nothing but a ceiling; where neither is sure, only the second.
-
-    No photograph tells how far away a plain area is. A plain pixel without a known `depth` (pixels,) shows the backdrop
-    if plain pixels lead up from it to the edge of the photograph (a wall ends at a roof, windows or the ground), and if
-    its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
-    Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
-    the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
-    the sky, 0.5 % without these pixels). `what_is_above` tells sky and ceiling apart.
+    If `what_is_above` returns "sky", the third mask is empty; if "ceiling", only the third is not; if "unknown", only
+    the second is not. A plain pixel without a known `depth` (pixels,), NaN if unknown, shows the backdrop if all pixels
+    from it up to the edge of the photograph are such pixels (a wall ends at a roof, windows or the ground), and if its
+    colour and temperature are those of most such pixels, as a function of direction (harmonics of degree 2). Plain
+    pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside the
+    backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on the
+    sky, 0.5 % without these pixels).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)
@@ -79,12 +78,12 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
 def what_is_above(
     photographs: Photographs, depth: Float32Array, plain: BoolArray, up: FloatArray
 ) -> Literal["sky", "ceiling", "unknown"]:
-    """Return whether `plain` pixels (pixels,) show a sky or the ceiling of a room, which looks like a cloudy sky.
+    """Return whether the pixels that are True in `plain` (pixels,) show a sky or the ceiling of a room.
 
-    In a room, known surfaces rise behind cameras too, as other photographs show (`SURROUNDED`). In a yard or a street
-    they do as well; there a sky is known by its temperature, which is below that of nearly all surfaces (`COLDER`) or
-    below all that the camera measures. Photographs without temperatures do not tell the two apart. `depth` is that of
-    all pixels, NaN where unknown, (pixels,); `up` is a unit vector, (3,).
+    If no surfaces of known `depth` (pixels,), NaN if unknown, rise behind the cameras (`SURROUNDED`), they show a sky.
+    In a room surfaces do, as other photographs show, but also in a yard or a street. There a sky is known by its
+    temperature, which is below that of nearly all surfaces (`COLDER`) or below all that the camera measures. Without
+    temperatures the result is "unknown": a ceiling looks like a cloudy sky. `up` is a unit vector, (3,).
     """
     (known,) = np.nonzero(np.isfinite(depth))
     some = known[:: max(1, len(known) // _SOME)]
@@ -105,10 +104,10 @@ def what_is_above(
 
 
 def upwards(photographs: Photographs) -> FloatArray:
-    """Return the unit vector that is up in the world, (3,), if cameras are held level, all upright or all on a side.
+    """Return the unit vector (3,) up in the world; cameras must be held level, all upright or all on a side.
 
     Up is as perpendicular as possible to one image axis of the photographs and as parallel as possible to the other.
-    Upright photographs tell its sign; with cameras on a side, up is where photographs are brighter.
+    With upright cameras, the images' own top gives the sign; with cameras on a side, photographs are brighter upwards.
     """
     sides = np.linalg.inv(photographs.matrices[:, :, :3]).transpose(2, 0, 1)[:2]  # to the right, and down
     right, down = sides / np.linalg.norm(sides, axis=2, keepdims=True)
@@ -123,7 +122,8 @@ def upwards(photographs: Photographs) -> FloatArray:
 
 
 def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
-    """Return the quarter turns (of `np.rot90`) that bring up to a photograph's top; None if it looks up or down."""
+    """Return the number of quarter turns (`np.rot90`) that bring a photograph's upper side to the top of the array.
+    `inverse` (3, 3) maps homogeneous pixels to world directions. None if the camera looks steeply up or down."""
     right, down, forward = inverse.T @ up / np.linalg.norm(inverse, axis=0)
     if abs(forward) > STEEPEST:
         return None
@@ -133,7 +133,8 @@ def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
 
 
 def even_pixels(picture: Float32Array) -> BoolArray:
-    """Return which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four around; none beside a mask."""
+    """Return which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four pixels beside them, (h, w). A
+    pixel that is masked, or beside a masked pixel, is False."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):
         small = np.abs(np.diff(picture, axis=axis)).max(-1) <= PLAIN
@@ -150,11 +151,10 @@ def _alike(
     chosen: BoolArray,
     measured: Float32Array | None = None,
 ) -> BoolArray:
-    """Return which pixels look like most of the `chosen` ones, by colour and, where known, temperature, (pixels,).
-
-    `values` are red, green, blue, temperature (pixels, 4), `directions` (pixels, 3). If colours were corrected, any
-    colour from the `measured` (pixels, 3) to the corrected one may match, and from a saturated one any brighter one.
-    """
+    """Return which pixels look like most of the `chosen` ones, by colour and, if known, temperature, (pixels,). The
+    expected look is fitted as a function of `directions` (pixels, 3). `values` (pixels, 4) are red, green, blue and
+    temperature. `measured` (pixels, 3) are colours before correction; None: there was none. Any colour between measured
+    and corrected one may match; for a saturated pixel, so may any brighter colour."""
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
     some = np.flatnonzero(chosen)
@@ -184,10 +184,8 @@ def _alike(
 
 
 def mean_colours(photographs: Photographs, backdrop: BoolArray, points: FloatArray) -> Float32Array:
-    """Return for each point (n, 3) the mean colour of the pixels that it projects to, without backdrop pixels, (n, 3).
-
-    A point without such a pixel gets the mean colour of all pixels that do not show the backdrop.
-    """
+    """Return for each point (n, 3) the mean colour, over photographs, of the pixels to which it projects, (n, 3).
+    Pixels of the backdrop do not count. A point without a pixel gets the mean colour of all pixels that count."""
     shown = np.isfinite(photographs.colours).all(1) & ~backdrop
     colours = photographs.colours
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))

@@ -19,17 +19,17 @@ WIDEST_DEG = 50.0  # Largest angle between the optical axes of two photographs t
 RATIO = 0.8  # Largest descriptor distance of a match relative to that of the second best candidate (Lowe 2004)
 REACH = 0.015  # Largest distance of a match from its epipolar line, relative to the photograph's width
 FEWEST_MATCHES = 8  # Photographs with fewer features are not compared
-FEWEST_TRACKS = 100  # Least number of tracks in all photographs together; fewer say nothing about poses
+FEWEST_TRACKS = 100  # Least number of tracks of a scene; fewer tell nothing about poses
 HELD_BACK = 3  # Every n-th track is held back from the trial adjustment and judges it
 WORTH_IT = 0.8
 """Adjusted poses are taken if the median distance between features and points of the tracks held back falls to at most
 this share of the distance with the given poses."""
 POSE_ERROR_DEG = 0.2
-"""Standard deviation assumed for the errors of given poses: about each axis, and of a position the length that this
-angle spans at the scene's distance. This prior alone holds turns and moves that cancel out in the photographs."""
+"""Standard deviation assumed for the errors of given poses: of rotations about each axis, and of positions as a length
+that this angle spans at the scene's distance. Only this prior limits rotations and moves that cancel in the images."""
 _FLATTEST = 1e-3  # Least eigenvalue of a point's normal matrix: two rays at an angle of some 2.6 degrees
 _ROUNDS, _SMALLEST_STEP = 20, 1e-6  # Most Gauss-Newton steps; a smaller step ends the adjustment
-_OUTLYING = 3.0  # A feature this many medians of the distance from its point has a quarter of the full weight
+_OUTLYING = 3.0  # A feature that is this many median distances from its point has a quarter of the full weight
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
@@ -43,14 +43,14 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Sightings of points: features of several photographs that show the same point form its track."""
+    """Sightings of points; the sightings of one point, features of several photographs, form its track."""
 
     photograph: IntArray  # Index of the photograph of each sighting, shape (s,)
     point: IntArray  # Number of the point of each sighting, from 0 without gaps, shape (s,)
     place: FloatArray  # x, y of each sighting at depth 1 in OpenCV camera axes, shape (s, 2)
 
     def of_points(self, chosen: BoolArray) -> Tracks:
-        """Return the tracks of the chosen points alone (one boolean per point), with points numbered anew."""
+        """Return only the tracks of the points that are True in `chosen` (points,), with points numbered anew."""
         kept = chosen[self.point]
         number = np.cumsum(chosen) - 1
         return Tracks(self.photograph[kept], number[self.point[kept]], self.place[kept])
@@ -63,7 +63,7 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPoses:
-    """Poses adjusted to features, and how well features held back fit before and after."""
+    """Adjusted poses, and the distances of held-back features from their points before and after."""
 
     poses: FloatArray  # Camera to world, OpenGL axes, shape (n, 4, 4)
     before_px: float  # Median distance between features held back and their points, with the given poses, [pixels]
@@ -72,7 +72,7 @@ class AdjustedPoses:
 
 
 def features_of(picture: npt.NDArray[np.uint8], mask: BoolArray | None = None) -> Features:
-    """Return the features (SIFT, Lowe 2004) of a grey photograph (h, w), only where its `mask` (h, w) is true.
+    """Return the features (SIFT, Lowe 2004) of a grey photograph (h, w) at pixels that are True in `mask` (h, w).
 
     Descriptors are square roots of normalised histograms (RootSIFT, Arandjelovic and Zisserman 2012), so that the
     brightness and contrast of the photograph do not matter.
@@ -90,8 +90,8 @@ def features_of(picture: npt.NDArray[np.uint8], mask: BoolArray | None = None) -
 def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: FloatArray) -> Tracks:
     """Match features of neighbouring photographs and return the tracks of the points that the matches link.
 
-    A match must be near its epipolar line by the given poses (camera to world, (n, 4, 4)). `cameras` belong to the
-    pictures in which features were found. Tracks with two features in one photograph are left out.
+    A match must be near its epipolar line by the given poses (camera to world, OpenGL, (n, 4, 4)). `cameras` must have
+    the size of the pictures in which features were found. Tracks with two features in a photograph are left out.
     """
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
@@ -130,18 +130,19 @@ def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: 
 
 
 def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int = 0) -> AdjustedPoses | None:
-    """Adjust poses to tracks by bundle adjustment, if tracks held back from a trial adjustment then fit better.
+    """Return poses adjusted to tracks by bundle adjustment, or None if the adjustment does not prove itself.
 
-    If `fixed` is 0, the adjusted poses as a whole keep the place, orientation and scale of the given poses.
+    It proves itself if tracks held back from a trial adjustment then fit better (`WORTH_IT`). If `fixed` is 0, the
+    adjusted poses as a whole keep the place, orientation and scale of the given poses.
 
     Args:
         tracks: Tracks of all photographs.
         poses: Given poses, camera to world, OpenGL axes, shape (n, 4, 4).
         focal: Focal lengths, which turn angles into pixels, shape (n,), [pixels].
-        fixed: Number of photographs, the first of the list, that keep their poses.
+        fixed: Number of photographs, at the beginning of `poses`, that keep their poses.
 
     Returns:
-        Adjusted poses; None if there are too few tracks or the tracks held back do not fit better (`WORTH_IT`).
+        Adjusted poses; None also if there are fewer than `FEWEST_TRACKS` tracks or a step is not finite.
     """
     middle = poses[:, :3, 3].mean(0)
     poses = poses.copy()
@@ -165,7 +166,7 @@ def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: in
 
 
 def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:
-    """Return the pairs of photographs to compare: each with its nearest `NEIGHBOURS` that look the same way."""
+    """Return pairs of photographs to compare: each with the nearest `NEIGHBOURS` within `WIDEST_DEG` of its axis."""
     pairs = set()
     for a in range(len(centres)):
         facing = rotations[:, 2] @ rotations[a, 2] > np.cos(np.deg2rad(WIDEST_DEG))
@@ -176,7 +177,8 @@ def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:
 
 
 def _matches(one: Float32Array, other: Float32Array) -> tuple[IntArray, IntArray]:
-    """Return the indices (m,), (m,) of features that are each other's best match, much better than the second best."""
+    """Return the indices (m,) in `one` and (m,) in `other` of descriptors that are each other's best match. Descriptors
+    are (k, 128). A match must also pass Lowe's ratio test against the second best candidate (`RATIO`)."""
     likeness = one @ other.T
     best = likeness.argmax(1)
     second = np.partition(likeness, -2, axis=1)[:, -2]
@@ -191,7 +193,7 @@ def _opencv(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _triangulated(tracks: Tracks, rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points nearest to the rays of their sightings (points, 3), and normal matrices (points, 3, 3)."""
+    """Return the least-squares points of the rays of their sightings, (points, 3), and their normal matrices."""
     rays = np.column_stack((tracks.place, np.ones(len(tracks.place))))
     rays = np.einsum("nji,nj->ni", rotations[tracks.photograph], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -219,7 +221,8 @@ def _distances(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> FloatArr
 
 
 def _plausible(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> Tracks:
-    """Return the tracks whose points are in front of their cameras, and whose rays nearly meet, at a fair angle."""
+    """Return the tracks whose points lie in front of all their cameras and near all rays, which meet at a fair angle.
+    Rays are near within six median distances, or 3 pixels if that is more."""
     if not tracks.points:
         return tracks
     rotations, centres = _opencv(poses)
@@ -232,12 +235,10 @@ def _plausible(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> Tracks:
 
 
 def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) -> FloatArray | None:
-    """Return poses (n, 4, 4) that bring features and points together (bundle adjustment, Triggs and others 2000).
-
-    Gauss-Newton steps minimise robust squared distances (Geman and McClure 1987), so that corners of roofs and
-    branches, which look different in each photograph, hardly count. Points are eliminated (Schur complement). The
-    errors expected of the given poses, `POSE_ERROR_DEG`, are a prior. Returns None if a step is not finite.
-    """
+    """Return poses (n, 4, 4) that minimise the distances between features and points, or None if a step is not finite.
+    This is bundle adjustment (Triggs and others 2000) by Gauss-Newton steps on robust squared distances (Geman and
+    McClure 1987): corners of roofs and branches, which look different in each photograph, hardly count. Points are
+    eliminated (Schur complement). The errors expected of the given poses, `POSE_ERROR_DEG`, are a prior."""
     from scipy import sparse
     from scipy.spatial.transform import Rotation
 
@@ -298,7 +299,7 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
 
 
 def _placed_like(poses: FloatArray, given: FloatArray) -> FloatArray:
-    """Return poses turned, scaled and moved by one similarity that brings them closest to the given poses."""
+    """Return poses after the similarity transform (rotation, scale, shift) that brings them closest to `given`."""
     u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", given[:, :3, :3], poses[:, :3, :3]))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     here, there = (each[:, :3, 3] - each[:, :3, 3].mean(0) for each in (poses, given))

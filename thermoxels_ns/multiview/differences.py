@@ -14,23 +14,24 @@ MOST_PIXELS = 1500  # Pixels of each photograph, or up to twice as many, that ar
 DARKEST, BRIGHTEST = 0.06, 0.94  # Pixels used for gains have channels between: noise below, saturation above
 FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
-"""Standard deviation, of 1, of the error besides noise of a channel's median ratio between two photographs: gloss,
-shadows, wrong depths."""
-SYSTEMATIC_THERMAL = 0.003  # As `SYSTEMATIC`, of the median difference of normalised temperatures
+"""Standard deviation, of 1, of the systematic error of a channel's median ratio between two photographs, which noise
+does not explain: gloss, shadows, wrong depths."""
+SYSTEMATIC_THERMAL = 0.003  # The same for the median difference of normalised temperatures
 SURE = 3.0  # Values larger than so many standard errors are not due to chance
-KNOWN = 1.0  # A value with at least this standard error is not known
-FREE = 10.0  # Standard error given to a value that is not known
+KNOWN = 1.0  # A value with this standard error or a larger one is unknown
+FREE = 10.0  # Standard error given to an unknown value
 _ROUNDS, _HUBER = 5, 2.0  # Rounds of robust least squares; a pair off by more standard errors than this counts less
 
 
 def without_gains(photographs: Photographs, log_gain: FloatArray) -> Photographs:
-    """Return photographs with colours divided by the gains exp(`log_gain`), (photographs, 3); `measured` stays."""
+    """Return photographs with colours divided by exp(`log_gain`), (photographs, 3); `measured` are the old colours."""
     gain = np.exp(log_gain).astype(np.float32)[photographs.numbers]
     return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
 
 
 def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
-    """Return whether the root mean square of known values is above `least` and `SURE` times that of their errors."""
+    """Return whether the root mean square of `value` is above `least` and above `SURE` times that of `error`. `error`
+    are the standard errors of `value`, of the same shape; values with an error of `KNOWN` or more do not count."""
     known = error < KNOWN
     if not known.any():
         return False
@@ -39,18 +40,14 @@ def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
 
 
 def photograph_differences(depths: Depths, thermal: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """Return how photographs differ, from points at which two photographs have found the same depth, (photographs, 4).
+    """Return gains and temperature offsets of the photographs, and their standard errors, both (photographs, 4).
 
-    Columns 0 to 2 are the natural logarithms of the gains of the channels, column 3 the offset of normalised
-    temperature, each relative to its mean over the photographs; the second array holds their standard errors.
-
-    For two photographs a and b, the median of ln(a / b) over shared pixels is the difference of their log gains, and
-    the median difference of temperatures that of their offsets. All pairs together are solved by weighted least
-    squares with a mean of 0. Photographs not linked to the others by pairs have values of 0 and errors of `FREE`.
-
-    Args:
-        depths: Depths of the photographs.
-        thermal: Normalised temperature of each pixel (pixels,); NaN: unknown.
+    Columns 0 to 2 are the natural logarithms of the gains of red, green and blue; column 3 is the offset of normalised
+    temperature. For two photographs a and b, compared at points at which both have the same depth, the median of
+    ln(a / b) is the difference of their log gains, and the median difference of `thermal` (pixels,), normalised
+    temperature with NaN for unknown, is the difference of their offsets. Each column is the robust, weighted least
+    squares solution for the largest group of photographs that pairs link, with mean 0 over this group. All other
+    photographs have values of 0 and errors of `FREE`.
     """
     photographs = depths.photographs
     count = len(photographs)
@@ -100,10 +97,10 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> tuple[Float
 
 
 def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return values x of photographs (count,) from differences `off` = x_a - x_b of pairs (a, b), and standard errors.
-
-    The robust fit is of the largest group that pairs of weight above 0 link, mean 0. The others have 0 and `FREE`.
-    """
+    """Return values x of `count` photographs from differences `off` (p,) = x_a - x_b of pairs (a, b), and errors. This
+    is iteratively reweighted least squares (Huber) with `weights` (p,), the inverse variances of `off`. Only the
+    largest group of photographs that `pairs` (p, 2) of weight above 0 link is solved; its mean is 0. All others have
+    the value 0 and the standard error `FREE`. Both results are (count,)."""
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
 

@@ -21,7 +21,7 @@ from thermoxels_ns.multiview.stereo import (
     rays_through,
 )
 
-LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure one; fewer may be chance
+LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure depth; fewer may be chance
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
 TAIL = 0.5  # Points left out at either end of an axis for the hull on which a ceiling lies, [%]
 FEWEST_POINTS = 100  # Points in the box that such a hull needs
@@ -34,7 +34,7 @@ LEAST_OFFSET_K = 0.1  # Offsets of thermal images are corrected if their root me
 class PhotographEvidence:
     """Evidence from training photographs before there is a model."""
 
-    photographs: Photographs  # Small photographs, with gains and offsets corrected where `log_gain` or `offset` is set
+    photographs: Photographs  # Small photographs, already corrected by `log_gain` and `offset`
     depth: Float32Array  # Depth of each pixel where it is sure, else NaN, shape (pixels,), [world units]
     backdrop: BoolArray  # True for pixels that show a plain backdrop, shape (pixels,)
     ceiling: BoolArray  # True for pixels that show the plain ceiling of a room, shape (pixels,)
@@ -45,10 +45,11 @@ class PhotographEvidence:
     offset: FloatArray | None  # Offset of normalised temperature, (photographs,); None: offsets were not corrected
 
     def plain_rays(self, lo: FloatArray, hi: FloatArray) -> FeatureRays | None:
-        """Return rays through the backdrop to points far behind the box from `lo` to `hi`, or to points on a ceiling.
+        """Return one ray per plain pixel: to far behind the box from `lo` to `hi` for a backdrop, else to the ceiling.
 
-        There is one ray per pixel; None if pixels are too few (`LEAST_SHARE`). A ceiling is taken to lie on the convex
-        hull of what is known in the box, without the outermost points along each axis (`TAIL`).
+        A ceiling is taken to lie on the convex hull of the known points in the box, without the outermost points along
+        each axis (`TAIL`). None if fewer than `LEAST_SHARE` of the pixels have a ray, or if a ceiling has fewer than
+        `FEWEST_POINTS` known points.
         """
         (chosen,) = np.nonzero(self.backdrop | self.ceiling)
         if len(chosen) < LEAST_SHARE * len(self.backdrop):
@@ -85,10 +86,10 @@ def evidence_of_photographs(
     gains: bool = True,
     offsets: bool = True,
 ) -> PhotographEvidence:
-    """Compare the photographs of a `ThermalDataset` and return the evidence.
+    """Return the evidence that the photographs of `dataset`, a `ThermalDataset`, give by comparison with each other.
 
-    Depths are sought farther than `near`, in the box from `lo` to `hi` and behind it, [world units]. Gains and offsets
-    are estimated, and corrected if they matter, where `gains` and `offsets` are True. `say` receives the findings.
+    Depths are sought beyond the depth `near`, in the box from `lo` to `hi` and behind it, [world units]. If `gains` or
+    `offsets` is True, these are estimated, and corrected if they matter. `say` receives the findings as text.
     """
     began = time.perf_counter()
     depths = depths_of(read_photographs(dataset, near), lo, hi)

@@ -1,4 +1,4 @@
-"""Photographs read as small pinhole pictures, to be compared with each other."""
+"""Reading of photographs as small pinhole pictures that are compared with each other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntAr
 from thermoxels_ns.core.camera import Camera
 
 MOST_PHOTOGRAPHS = 64  # Most photographs that are compared; from a longer list, evenly spaced ones are taken
-SATURATED = 0.98  # Channel value, of 1, from which on the scene may have been brighter than the pixel shows
+SATURATED = 0.98  # Channel value, of 1, at or above which the scene may have been brighter than the pixel shows
 LONGEST_SIDE = 160  # Pixels along the longer side of photographs that are compared; larger ones are averaged down
 
 
@@ -30,7 +30,7 @@ class Photographs:
     """Red, green, blue in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
     thermal: Float32Array
     """Normalised temperature, shape (pixels,); NaN where unknown or where thermal images have a camera of their own."""
-    near: float = 0.0  # Depth in front of which nothing stands, [world units]
+    near: float = 0.0  # Depth before which nothing stands, [world units]
     index: IntArray | None = None  # Index of each photograph in its dataset; None: not from a dataset
     measured: Float32Array | None = None
     """`colours` before gains were corrected, shape (pixels, 3); None: gains were not corrected."""
@@ -44,17 +44,15 @@ class Photographs:
         return len(self.matrices)
 
     def of_pixels(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return camera centres and directions to depth 1 of the pixels `chosen` (n,), both (n, 3), in the world."""
+        """Return camera centres, and directions of depth 1, of the pixels `chosen` (n,), both (n, 3), world axes."""
         number = np.searchsorted(self.firsts, chosen, side="right") - 1
         place, width = chosen - self.firsts[number], self.sizes[number, 0]
         pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
     def shown(self, number: int, points: FloatArray) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Return where photograph `number` shows points (n, 3): index in `colours`, depth, and if in view, each (n,).
-
-        A point that is not in view has the index of the photograph's first pixel. Occlusion is not considered.
-        """
+        """Return pixel index in `colours`, depth, and whether in view, of points (n, 3) in photograph `number`. Each
+        has shape (n,). A point out of view has the index of the photograph's first pixel. Occlusion is ignored."""
         seen = points @ self.matrices[number, :, :3].T + self.matrices[number, :, 3]
         depth = seen[:, 2]
         place = np.floor(seen[:, :2] / np.where(depth > 0.0, depth, np.inf)[:, None]).astype(np.int64)
@@ -64,18 +62,16 @@ class Photographs:
 
 
 def read_photographs(dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS) -> Photographs:
-    """Read at most `most` evenly spaced photographs of a `ThermalDataset` as small pinhole pictures.
-
-    Photographs with a side longer than `LONGEST_SIDE` are averaged down to this size. `near` is that of `Photographs`.
-    """
+    """Return at most `most` evenly spaced photographs of a `ThermalDataset` as small pinhole pictures. Photographs with
+    a side longer than `LONGEST_SIDE` are averaged down to this side. See `Photographs` for `near`."""
     chosen = np.linspace(0, len(dataset) - 1, min(most, len(dataset))).round().astype(int)
     pinholes = [_photograph(dataset, int(index)) for index in chosen]
     return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in chosen], near), index=chosen)
 
 
 Pinhole = tuple[Float32Array, Float32Array, FloatArray]
-"""A photograph without distortion, shape (h, w, 3), NaN where masked; its normalised temperature, (h, w), NaN where
-unknown; and the matrix from the world to homogeneous pixels, (3, 4)."""
+"""Three arrays: a photograph without distortion, (h, w, 3), NaN where masked; its normalised temperature, (h, w), NaN
+where unknown; the matrix from the world to homogeneous pixels, (3, 4)."""
 
 
 def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 0.0) -> Photographs:
@@ -104,8 +100,8 @@ def _photograph(dataset: Any, index: int) -> Pinhole:
 def thermal_at(dataset: Any, photographs: Photographs, depth: Float32Array) -> Float32Array:
     """Return the normalised temperature at the pixels of photographs, shape (pixels,); NaN where unknown.
 
-    If the dataset has thermal cameras, the temperature is looked up where the thermal image shows the pixel's point at
-    `depth` (pixels,), and is NaN where `depth` is. Occlusion is ignored, as both cameras stand side by side.
+    If the dataset has separate thermal cameras, the temperature is that of the thermal pixel which shows the point at
+    `depth` (pixels,), and NaN if the depth is NaN. Occlusion is ignored, because both cameras stand side by side.
     """
     if dataset.thermal_cameras is None:
         return photographs.thermal
@@ -135,10 +131,10 @@ def pinhole(
     longest_side: int = LONGEST_SIDE,
     thermal: Float32Array | None = None,
 ) -> Pinhole:
-    """Return a photograph (h, w, 3) averaged down to `longest_side` [pixels], without its camera's distortion.
+    """Return a photograph (h, w, 3) as a `Pinhole`, averaged down to `longest_side` pixels and without distortion.
 
-    Pixels outside its `mask` (h, w) become NaN; None: no mask. `thermal` is the normalised temperature by the same
-    camera, at any resolution; None: unknown. `pose` is camera to world, (3, 4) or (4, 4), OpenGL axes.
+    Pixels that are False in `mask` (h, w) become NaN; None: no mask. `thermal` is the normalised temperature by the
+    same camera, at any resolution; None: unknown. `pose` is camera to world, (3, 4) or (4, 4), OpenGL axes.
     """
     picture = photograph.astype(np.float32)
     picture /= np.float32(255.0)
@@ -165,7 +161,7 @@ def pinhole(
 
 
 def _distorted_places(camera: Camera) -> tuple[Float32Array, Float32Array]:
-    """Return columns and rows (h, w), for `cv2.remap`, at which the distorted picture shows each undistorted pixel."""
+    """Return columns and rows, (h, w) each, in the distorted picture of each undistorted pixel, for `cv2.remap`."""
     pinhole = replace(camera, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
     rows, columns = np.mgrid[: camera.height, : camera.width]
     pixels = camera.project(pinhole.rays(np.column_stack((columns.ravel() + 0.5, rows.ravel() + 0.5)))) - 0.5

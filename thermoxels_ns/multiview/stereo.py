@@ -21,52 +21,52 @@ from thermoxels_ns.multiview.stereo_kernels import (
 )
 
 NEIGHBOURS = 4
-"""Most photographs that each photograph is compared with. At each pixel the better half of these neighbours counts, as
-in the other half the surface may be hidden."""
+"""Most photographs that each photograph is compared with, its neighbours. At each pixel only the better half of them
+counts, because the surface may be hidden in the other half."""
 ANGLES_DEG = (4.0, 60.0)
-"""Limits of the angle between the rays of two photographs to a point, for the photographs to be compared: below, the
-angle tells nothing about depth; above, the surface looks too different."""
+"""Least and largest angle between the rays of two photographs to a point at which they are compared. Smaller angles
+tell nothing about depth; at larger angles the surface looks too different."""
 BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
 RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pixels wide
 LIKENESS = 0.025
-"""Least difference from the middle pixel of a patch, of 1, at which a pixel has 37 % of the middle pixel's weight; a
-typical difference around the middle pixel takes its place where that is larger."""
+"""Least scale s, of 1, of the weights exp(-(d / s)^2) in a patch (see `weigh_patches`), where d is the difference of a
+pixel from the middle pixel."""
 LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
-"""Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
+"""Least and most planes per photograph. Between these limits the picture moves by about a pixel from plane to plane."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
-"""Standard deviations of noise: of brightness, of 1, and of temperature, of the scene's range. Differences between two
-photographs are taken to deviate by at least as much."""
+"""Standard deviations of the noise of brightness, of 1, and of temperature, of the scene's range. They are also the
+least standard deviations of differences between two photographs."""
 DIFFERENCE, ALIKE = 0.4, 2.0
-"""Cost of a pixel that differs by at least `ALIKE` standard deviations from what another photograph shows on a plane; a
-smaller difference costs in proportion. The deviations are those on the planes on which patches correlate best, which on
-a ramp may be wrong ones; taking them from sure depths alone found no more. Correlation cannot tell apart places along a
-shallow ramp, nor say where an even area ends: pixels of the body with a depth rise from 37, 55, 35 and 52 % to 61, 66,
-49 and 54 % with this and `PAIRS_IN_LINE` (wild-7, courtyard, white house, saharov32), and the wrong ones among them
-fall to half or less. Costs of 0.1 to 0.6 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1. Where texture is
-as fine as pixels, differences are noise: a drawn block before far walls of random pixels loses 12 % of its depths."""
+"""Cost of a pixel that differs by `ALIKE` or more standard deviations from what another photograph shows on a plane; a
+smaller difference costs in proportion. The standard deviation is measured on the planes on which patches correlate
+best. On a ramp these may be wrong planes, but sure depths alone gave no better result. Correlation cannot tell apart
+places along a shallow ramp, nor say where an even area ends: with this cost and `PAIRS_IN_LINE`, pixels of the body
+with a depth rise from 37, 55, 35 and 52 % to 61, 66, 49 and 54 % (wild-7, courtyard, white house, saharov32), and the
+wrong ones among them fall to half or less. Costs of 0.1 to 0.6 and limits of 2 to 6 were tried, with margins of 0.03 to
+0.1. If texture is as fine as pixels, differences are noise: a drawn block before random pixels loses 12 % of depths."""
 STEP, JUMP = 0.05, 0.6
-"""Costs of a change of one plane, and of several planes, between pixels side by side. The cost of a correlation r is
+"""Costs of a change of one plane, and of several planes, between pixels side by side; a correlation r costs
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
 MARGIN = 0.06  # Least cost by which the best plane must beat every plane more than two planes away
-TOLERANCE = 0.3  # Depths of two photographs agree if they differ by this share of the sum of their planes' distances
+TOLERANCE = 0.3  # Depths of two photographs agree if they differ by at most this share of the sum of plane spacings
 FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
-PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
-LEAST_CORRELATION = 0.6  # With less, a depth on the farthest plane is not accepted
+PAIRS_IN_LINE = 3  # Least number, of the four pairs of opposite neighbours, with which a sure pixel must be in line
+LEAST_CORRELATION = 0.6  # Least correlation at which a depth on the farthest plane is accepted
 ERROR_PLANES = 0.1
-"""Error of a depth that trainings and votes reckon with, in planes of the sweep. Of single pixels 68 % are within 0.26
-to 0.29 planes (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade,
-courtyard and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
+"""Standard error of a depth that trainings and votes assume, in spacings of planes. Of single pixels 68 % are within
+0.26 to 0.29 (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade, courtyard
+and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
-"""Value of a pixel that a photograph does not show. Interpolation between this and other pixels stays below 0."""
-_FEWEST_ALIKE = 30  # Pixels from which the typical difference of two photographs is taken
+"""Value of a pixel that a photograph does not show. Interpolation between this value and other pixels is below 0."""
+_FEWEST_ALIKE = 30  # Fewest pixels from which the standard deviation of two photographs' differences is taken
 _PROBES = (5, 4)  # Points along each side of a photograph, and depths, at which neighbours are looked for
 _FEWEST_PROBES = 0.1  # Share of these points that a neighbour must see
 _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
-"""Depths tried where no box is known, relative to the root mean square distance of the cameras from their middle."""
+"""Depths tried if no box is known, relative to the root mean square distance of the cameras from their mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Depths:
     photographs: Photographs
     depth: Float32Array
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: Float32Array  # Distance between planes of the sweep at each depth, shape (pixels,), [world units]
+    error: Float32Array  # Spacing of the planes of the sweep at each depth, shape (pixels,), [world units]
 
     @property
     def share(self) -> float:
@@ -85,31 +85,28 @@ class Depths:
 
 
 def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray, BoolArray]:
-    """Set wrong depths beside a backdrop to NaN; return the depths, and which pixels show backdrop and ceiling."""
+    """Return depths with wrong ones beside a backdrop set to NaN, and masks (pixels,) of plain backdrop and ceiling."""
     backdrop, beside, ceiling = plain_backdrop(depths.photographs, depths.depth)
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop, ceiling
 
 
 def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt.ArrayLike | None = None) -> Depths:
-    """Find the depths of the pixels of photographs in a box and behind it, or, without a box, where views overlap.
+    """Return the depths of the pixels of photographs by plane sweep (Collins 1996) and semi-global matching.
 
-    For each photograph, neighbouring photographs are drawn onto planes parallel to its image, one behind the other, and
-    compared with the photograph patch by patch (plane sweep, Collins 1996; normalised cross-correlation): by brightness
-    and, where the same camera measured it, temperature. Low correlation is a cost, and so is a difference of the pixels
-    themselves, relative to what the two photographs differ by where they correlate. Costs are added up along paths
-    through the photograph (semi-global matching, Hirschmueller 2008), so that a pixel without texture takes the depth
-    of similar pixels beside it. The plane of least cost gives the depth of a pixel if it beats the planes farther away
-    by `MARGIN`. A depth is sure if enough other photographs have found a depth at the same point, few photographs look
-    through the point, and the pixels around lie in line with it. Within a patch only pixels that look like the middle
-    one count: else pixels beside an outline would take the outline's depth.
+    For each photograph, its neighbours are drawn onto planes parallel to its image. Patches are compared by normalised
+    cross-correlation of brightness and, if the same camera measured it, temperature. In a patch only pixels that look
+    like the middle one count: otherwise pixels beside an outline would take the outline's depth. The cost of a plane is
+    low correlation plus the difference of the pixels (`DIFFERENCE`). Costs are summed along paths through the
+    photograph (Hirschmueller 2008), so that a pixel without texture takes the depth of similar pixels beside it. The
+    plane of least cost gives the depth if it beats all planes more than two planes away by `MARGIN`. A depth is sure if
+    enough other photographs have a depth at the same point, if few photographs look through the point, and if the
+    surrounding pixels lie in line with it. Planes reach through the box and behind it; without a box, they reach
+    through the depths at which views overlap.
 
     Args:
-        photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their size.
+        photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their width.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner of the box. None: no box.
-
-    Returns:
-        Depths, NaN where not sure; all are NaN if no photograph has a neighbour.
     """
     corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
@@ -140,10 +137,11 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
 
 
 def other_views(photographs: Photographs, depth: Float32Array, error: Float32Array) -> tuple[IntArray, IntArray]:
-    """Count for each pixel the other photographs that agree with its depth, and those that look through its point.
+    """Return for each pixel the number of other photographs that agree with its depth, and that look through its point.
 
-    Depths agree if they differ by at most `TOLERANCE` times the sum of both pixels' `error`. A photograph looks through
-    the point if its depth there is farther by more than twice that sum. All arrays are (pixels,).
+    A photograph agrees if its depth at the point differs by at most `TOLERANCE` times the sum of both pixels' `error`,
+    the spacings of planes. It looks through the point if its depth there is farther by more than twice that sum. All
+    arrays are (pixels,); a `depth` of NaN is unknown.
     """
     agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
     (known,) = np.nonzero(np.isfinite(depth))
@@ -170,8 +168,8 @@ class _View:
     channels: Float32Array
     """Brightness and, where the same camera measured it, temperature, shape (1 or 2, h, w); `_OUTSIDE` where masked."""
     features: Float32Array
-    """Numbers by which pixels are found to look alike, shape (h, w, 3 or 4): a third of each colour, and temperature,
-    which sets a cold sky apart."""
+    """Values by which pixels are compared within the photograph, shape (h, w, 3 or 4): a third of each colour, and
+    temperature, which sets a cold sky apart."""
     matrix: FloatArray  # World to homogeneous pixels, (3, 4)
     inverse: FloatArray  # Homogeneous pixels to directions of depth 1 in the world, (3, 3)
     centre: FloatArray  # Camera centre in the world, (3,)
@@ -200,7 +198,7 @@ class _View:
 
 
 def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[float, float] | None:
-    """Return the least and largest depth of the box in a photograph; None if the whole box is nearer than `near`."""
+    """Return the least and largest depth of the box `low` to `high` in a view; None if all of it is before `near`."""
     corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
     depth = corners @ view.matrix[2, :3] + view.matrix[2, 3]
     far = float(depth.max())
@@ -210,8 +208,8 @@ def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[
 
 
 def _overlap(photographs: Photographs, number: int) -> tuple[float, float] | None:
-    """Return the least and largest depth at which two other photographs usefully see enough of the points that
-    photograph `number` sees (`_usefully_seen`); None if fewer than two depths qualify."""
+    """Return the least and largest depth at which at least two other photographs see enough of what photograph
+    `number` sees, at angles within `ANGLES_DEG`; None if fewer than two of the depths tried qualify."""
     centres = photographs.centres
     depths = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()) * _DEPTHS_PER_SPREAD
     points, others = _probes(photographs, number, depths), np.zeros(len(depths) * _PROBES[0] ** 2, int)
@@ -222,7 +220,7 @@ def _overlap(photographs: Photographs, number: int) -> tuple[float, float] | Non
 
 
 def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatArray:
-    """Return points that a photograph sees, on a grid of pixels at each of the depths, (depths * pixels, 3)."""
+    """Return the world points on a grid of pixels of a photograph at each of the depths, (depths * pixels, 3)."""
     columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in photographs.sizes[number])
     pixels = np.stack(np.meshgrid(columns, rows, [1.0]), -1).reshape(-1, 3)
     along = pixels @ np.linalg.inv(photographs.matrices[number, :, :3]).T
@@ -232,7 +230,8 @@ def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatA
 def _usefully_seen(
     photographs: Photographs, number: int, other: int, points: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which points (n, 3) two photographs see at an angle within `ANGLES_DEG`, and that angle, [degrees]."""
+    """Return the masks (n,) of the points (n, 3) that photograph `other` shows at an angle, between its ray and that of
+    photograph `number`, within `ANGLES_DEG`; and the angles (n,), [degrees]."""
     towards, away = (photographs.centres[each] - points for each in (number, other))
     lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
     cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(lengths, 1e-12)
@@ -241,7 +240,8 @@ def _usefully_seen(
 
 
 def _neighbours(photographs: Photographs, number: int, near: float, far: float) -> list[int]:
-    """Return the at most `NEIGHBOURS` photographs that see most of what photograph `number` sees, at good angles."""
+    """Return the best `NEIGHBOURS` (or fewer) photographs for comparison with photograph `number`: those that see most
+    of what it sees between depths `near` and `far` at angles near `BEST_ANGLE_DEG`."""
     points = _probes(photographs, number, 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
     worth = np.zeros(len(photographs))
     for other in range(len(photographs)):
@@ -253,7 +253,8 @@ def _neighbours(photographs: Photographs, number: int, near: float, far: float) 
 
 
 def _sweep(view: _View, others: list[_View], near: float, far: float, endless: bool) -> tuple[FloatArray, ...]:
-    """Return depths, NaN where not sure, and distances of planes, (pixels,); if `endless`, with planes behind `far`."""
+    """Return depths, NaN where not sure, and spacings of planes at these depths, (pixels,) each, [world units]. Planes
+    reach from depth `near` to `far`; if `endless` is True, more planes stand behind `far`."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
     beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
     farthest = 0.5 * inverse_depths[0] / max(1, beyond)
@@ -296,13 +297,12 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
 
 
 def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Return what other photographs are expected to show, shape of `at_best`, and by how much they may differ from it.
-
-    The first is the photograph's own brightness times the median ratio, or its temperature plus the median difference,
-    over all pixels of `at_best` (photographs, c, h, w): what others show on the plane where patches correlate best (by
-    at least `LEAST_CORRELATION`, else `_OUTSIDE`). The second, (photographs, c, 1, 1), is `ALIKE` standard deviations
-    of the same pixels from what is expected, infinite where too few pixels tell. Masked pixels stay far below 0.
-    """
+    """Return the pixels that other photographs are expected to show, and limits of their differences from these pixels.
+    `at_best` (photographs, c, h, w) is what the others show at each pixel on the plane on which patches correlate best;
+    `_OUTSIDE` if they correlate by less than `LEAST_CORRELATION`. The expected pixels, of the same shape, are the
+    view's own brightness times the median ratio, or its temperature plus the median difference, over all pixels. The
+    limits, (photographs, c, 1, 1), are `ALIKE` robust standard deviations of `at_best` from the expected pixels;
+    infinite if fewer than `_FEWEST_ALIKE` pixels are known. Masked pixels of the result are far below 0."""
     expected = np.broadcast_to(view.channels, at_best.shape).copy()
     limit = np.full((*at_best.shape[:2], 1, 1), np.inf, np.float32)
     for number, channel in np.ndindex(*at_best.shape[:2]):
@@ -319,11 +319,9 @@ def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, 
 
 
 def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
-    """Return which pixels lie in line with `PAIRS_IN_LINE` pairs of opposite neighbours, of four, shape (h, w).
-
-    On a plane, inverse depth is linear in the image. The pixel may be off the middle of a pair by one spacing of planes
-    of the sweep, `error`.
-    """
+    """Return which pixels (h, w) lie in line with at least `PAIRS_IN_LINE` of their four pairs of opposite neighbours.
+    On a plane, inverse depth is linear in the image. A pixel is in line if it is off the middle of the pair by at most
+    the spacing of planes, `error`."""
     height, width = depth.shape
     framed, count = 1.0 / np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
     for row, column in ((0, 0), (0, 1), (0, 2), (1, 0)):
@@ -333,7 +331,8 @@ def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Return how many planes it takes for the picture's middle to move by a pixel per plane where it moves most."""
+    """Return the number of planes for which the view's middle pixel moves by at most about a pixel per plane in
+    every other photograph, within the limits `PLANES`."""
     height, width = view.shape
     middle = view.centre + np.outer((near, far), view.inverse @ (0.5 * width, 0.5 * height, 1.0))
     most = 0.0
@@ -345,7 +344,7 @@ def _num_planes(view: _View, others: list[_View], near: float, far: float) -> in
 
 
 def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> None:
-    """Fill `warped` (c, h, w) with what `view` would see if `other` were painted on the plane at `depth` of `view`."""
+    """Write to `warped` (c, h, w) what `view` would see if `other` were projected onto the plane at its `depth`."""
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV's pixel centres are whole numbers
@@ -362,8 +361,8 @@ def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> No
 
 
 def _between(cost: Float32Array, best: IntArray) -> FloatArray:
-    """Return where the cost is least relative to plane `best` (of the last axis), in -1/2 to 1/2 planes, (h, w): the
-    bottom of the parabola through the costs of three planes; 0 at the first and last plane."""
+    """Return the offset of the least cost from plane `best` (h, w), in planes, -1/2 to 1/2, (h, w): the vertex of the
+    parabola through `cost` (h, w, planes) at `best` and both neighbours; 0 at the first and last plane."""
     inner = np.clip(best, 1, cost.shape[-1] - 2)
     before, at, behind = (
         np.take_along_axis(cost, inner[..., None] + step, -1)[..., 0].astype(np.float64) for step in (-1, 0, 1)
@@ -375,9 +374,7 @@ def _between(cost: Float32Array, best: IntArray) -> FloatArray:
 
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     """Return one feature ray per sure pixel, each to a point of its own, photograph after photograph, [world units].
-
-    A ray's uncertainty is `ERROR_PLANES` times the distance between planes of the sweep, measured along the ray.
-    """
+    The uncertainty of a ray is `ERROR_PLANES` times the spacing of planes, measured along the ray."""
     (sure,) = np.nonzero(np.isfinite(depths.depth))
     depth, error = (values[sure].astype(np.float64) for values in (depths.depth, depths.error))
     return rays_through(depths.photographs, sure, depth, ERROR_PLANES * error)

@@ -1,4 +1,4 @@
-"""Compiled loops of stereo: correlation of patches, differences of pixels, costs along paths."""
+"""Compiled loops of stereo: normalised cross-correlation, differences of pixels, semi-global matching."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ OUTSIDE = -1.0  # Result where no correlation can be computed
 
 @kernel
 def _difference(features, row, column, i, j):
-    """Return the sum of the absolute differences of the features of two pixels."""
+    """Return the sum of the absolute differences of `features` (h, w, f) at pixels (row, column) and (i, j)."""
     off = 0.0
     for n in range(features.shape[2]):
         off += abs(features[i, j, n] - features[row, column, n])
@@ -20,14 +20,21 @@ def _difference(features, row, column, i, j):
 
 @kernel
 def weigh_patches(features, channels, radius, likeness, least_weight, noise, weights, means, variances):
-    """Fill `weights`, `means` and `variances` of the patch around each pixel; similar pixels have large weights.
+    """Write adaptive support weights and the weighted mean and variance of the patch around each pixel.
 
-    A patch reaches `radius` pixels from its middle. The weight of a pixel in it is exp(-(d / s)^2), or 0 below
-    `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). d is the difference between the
-    `features` (h, w, f) of the pixel and of the middle; s is the fifth smallest d of the eight pixels around the middle
-    but at least `likeness`. An outline leaves s small, a texture does not. `weights`, (patch, h, w), sum to
-    1 in a patch. The variance of one of the `channels` (c, h, w) is 0 where the patch leaves the photograph, holds a
-    masked pixel (below 0), or has a variance below `noise` (c,). Means and variances are (c, h, w).
+    Args:
+        features: Values by which pixels are compared, (h, w, f).
+        channels: Brightness and perhaps temperature, (c, h, w); below 0 where masked.
+        radius: A patch is 2 `radius` + 1 pixels wide.
+        likeness: Least scale s of differences. An outline in a patch leaves s small; a texture makes s large.
+        least_weight: A smaller weight is set to 0.
+        noise: Variance of the noise of each channel, (c,).
+        weights: Receives exp(-(d / s)^2), normalised to sum 1 in each patch, (patch, h, w) (Yoon and Kweon 2006,
+            without distance). d is the difference of a pixel's features from the middle pixel's, s the fifth smallest d
+            of the eight pixels around the middle.
+        means: Receives the weighted mean of each channel in the patch around each pixel, (c, h, w).
+        variances: Receives the weighted variance, (c, h, w). 0 marks a pixel that cannot be correlated: its patch
+            leaves the photograph, has a masked pixel, or has a variance below `noise`.
     """
     count, height, width = channels.shape
     side = 2 * radius + 1
@@ -66,13 +73,12 @@ def weigh_patches(features, channels, radius, likeness, least_weight, noise, wei
 
 @kernel(fastmath={"contract"})
 def correlate(channels, others, radius, weights, means, variances, noise, count, plane, result):
-    """Fill ``result[row, column, plane]`` with a pixel's mean correlation with the best `count` of `others`.
-
-    `others`, (photographs, c, h, w), are photographs drawn onto the pixels of `channels` (c, h, w). A correlation is
-    weighted, normalised cross-correlation with `noise` (c,) added to both variances; channels are averaged by their
-    ratio of signal to noise. A channel is left out for a photograph whose patch is masked (below 0) at a corner or in
-    the middle. Where no channel is left, or none has a variance, the photograph counts as `OUTSIDE`.
-    """
+    """Write the mean correlation of each pixel with the best `count` of `others` to ``result[row, column, plane]``.
+    `others` (photographs, c, h, w) are photographs drawn onto the pixels of `channels` (c, h, w); `result` is (h, w,
+    planes). `radius`, `weights`, `means`, `variances` and `noise` are those of `weigh_patches`. A correlation is
+    normalised cross-correlation of weighted patches with `noise` added to both variances. Channels are averaged by
+    their ratio of signal to noise. A channel is left out for a photograph whose patch is masked (below 0) at a corner
+    or in the middle. A photograph without a channel that has a variance counts as `OUTSIDE`."""
     kinds, height, width = channels.shape
     inner = width - 2 * radius
     scores, known = np.empty((len(others), inner), np.float32), np.empty((len(others), inner), np.bool_)
@@ -130,13 +136,11 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 
 @kernel(fastmath={"contract"})
 def add_differences(others, expected, limit, weight, count, plane, cost):
-    """Add to ``cost[row, column, plane]`` how far the best `count` of `others` are from what is expected of them.
-
-    The difference of a pixel of `others` (photographs, c, h, w) from `expected`, of the same shape, is relative to
-    `limit` (photographs, c, 1, 1), at most 1, and averaged over channels and photographs. It is multiplied by `weight`.
-    A channel is left out where its limit is infinite, where `expected` is masked (below -1), or where the other
-    photograph has no temperature (below 0). One that shows no brightness, or has no channel left, differs by 1.
-    """
+    """Add to ``cost[row, column, plane]`` `weight` times the mean difference of the best `count` of `others`. The
+    difference of a photograph is the mean over channels of |others - expected| / limit, each at most 1. `others` and
+    `expected` are (photographs, c, h, w), and `limit` is (photographs, c, 1, 1). A channel is left out if its limit is
+    infinite, if `expected` is masked (below -1), or if the other photograph has no temperature (below 0). A photograph
+    that shows no brightness (below 0), or has no channel left, has the difference 1."""
     total, kinds, height, width = others.shape
     best = np.empty(count, np.float32)
     for row in range(height):
@@ -159,11 +163,10 @@ def add_differences(others, expected, limit, weight, count, plane, cost):
 
 @kernel(fastmath={"contract"})
 def aggregate(cost, features, small, large, edge, total):
-    """Fill `total` with the mean of the least costs of paths from eight directions (Hirschmueller 2008, eq. 13).
-
-    Between two pixels of a path, a change of one plane costs `small`. A larger change costs `large` / (1 + d / `edge`),
-    at least `small`; d is the difference of the pixels' `features` (h, w, f). `cost` and `total`: (h, w, planes).
-    """
+    """Write the mean over eight directions of the least path costs to `total` (semi-global matching). This is eq. 13 of
+    Hirschmueller 2008. Between two pixels of a path, a change of one plane costs `small`. A larger change costs `large`
+    / (1 + d / `edge`), but at least `small`, with d the difference of the two pixels' `features` (h, w, f). `cost` (h,
+    w, planes) is the cost of each pixel and plane alone; `total` has the same shape."""
     rows, columns, planes = cost.shape
     total[:] = 0.0
     path = np.empty((2, columns, planes), np.float32)

@@ -1,4 +1,4 @@
-"""Votes of photographs: which voxels are air, and which surfaces lie where their depths are."""
+"""Votes of photographs: which voxels are air, and which surfaces lie at the photographs' depths."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FEWEST_POINTS = 2  # Points whose rays must cross a voxel before it counts as fr
 
 
 def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
-    """Return which voxels are air, shape `lattice.cell_shape`.
+    """Return a mask of the voxels that are air, shape `lattice.cell_shape`.
 
-    A voxel is free if the rays to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
-    `MARGIN_ERRORS` standard errors before their points, and if no point, with or without rays, lies in it. A free voxel
-    is air if its six neighbours are free too, because a ray that grazes a surface crosses voxels that hold a part of
-    the surface. (Drawn white house and courtyard, 32 and 128 voxels: 1 to 6 % of the voxels on the surface are free and
-    at most 0.04 % are air; 50 to 75 % of the voxels that truly are air are found.)
+    A voxel is free if it has no point, and if rays to at least `FEWEST_POINTS` points cross it and leave it at least
+    `MARGIN_VOXELS` voxels plus `MARGIN_ERRORS` standard errors before their points. A free voxel is air if its six
+    neighbours are free too, because a ray that grazes a surface crosses voxels with a part of the surface. (Drawn white
+    house and courtyard, 32 and 128 voxels: 1 to 6 % of the voxels on the surface are free and at most 0.04 % are air;
+    50 to 75 % of the voxels that truly are air are found.)
     """
     crossing, points = votes(lattice, rays)
     free = (crossing >= FEWEST_POINTS) & (points == 0)
@@ -35,9 +35,9 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
 
 
 def hardly_shown(points: FloatArray, views: Views) -> BoolArray:
-    """Return which points (n, 3) are in view of fewer than two photographs, as around cameras and behind them, (n,).
+    """Return for each point (n, 3) whether fewer than two photographs show it, as around and behind cameras, (n,).
 
-    Nothing tells how far away a thing is that one photograph shows, and no ray of another refutes a lump there. (A real
+    At such a point no second photograph tells a depth, and no ray of another photograph refutes a floater. (A real
     room, draft quality: 22.2 dB with gains and poses fitted and 1.9 K without this rule, 23.2 dB and 1.4 K with it.)
     """
     eyes, left = views.camera_to_world[:, :, 3], np.arange(len(points))
@@ -49,7 +49,8 @@ def hardly_shown(points: FloatArray, views: Views) -> BoolArray:
 
 
 def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
-    """Return two counts per voxel: points with a ray that crosses it and ends a margin behind it, and points in it."""
+    """Return two counts per voxel, both `lattice.cell_shape`: the points with a ray that crosses the voxel and leaves
+    it at least the margin of `air_voxels` before its end, and the points in the voxel."""
     shape = np.asarray(lattice.cell_shape)
     origins, ends = lattice.world_to_index(rays.origins), lattice.world_to_index(rays.points)
     margin = MARGIN_VOXELS + MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
@@ -63,10 +64,9 @@ def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
 
 @kernel
 def _count_crossings(origins, point, ends, margin, shape, crossing, last):
-    """Add to `crossing` 1 per voxel and point, if a ray to the point leaves the voxel `margin` before its end.
-
-    Coordinates are corner indices of the lattice. Rays to one point stand together, so that a point counts once.
-    """
+    """Add 1 to ``crossing[voxel]`` for each point with a ray that leaves the voxel at least its margin before its end.
+    `origins`, and `ends` by number of the point, are in corner indices, `margin` (rays,) is in voxels. `point` (rays,)
+    must ascend, so that each point counts once. `last` (voxels,), the last point counted, must be -1 at the start."""
     cells, faces = np.empty(shape.sum(), np.int64), np.empty(shape.sum() + 1)
     for n in range(len(origins)):
         along = ends[point[n]] - origins[n]
@@ -83,10 +83,10 @@ def _count_crossings(origins, point, ends, margin, shape, crossing, last):
 def supporting_photographs(
     depths: Depths, middle: FloatArray, seen: BoolArray, voxel_size: float, tracks: FeatureRays | None = None
 ) -> BoolArray:
-    """Return which photographs support a surface at given places, as their own depth or a track's point lies on it.
+    """Return which photographs support a surface at given places because their own depth or a track's point lies there.
 
-    A photograph without a sure depth at a place (see `depths_of`), as on a plain wall, supports it by tracks alone. A
-    surface that hangs in free space is not supported, because the depths there are those of what stands behind it.
+    If a photograph has no sure depth at a place (see `depths_of`), as on a plain wall, only tracks can support it. A
+    surface that hangs in free space is not supported, because photographs have the depths of what stands behind it.
 
     Args:
         depths: Depths of the photographs.
@@ -110,7 +110,7 @@ def supporting_photographs(
 
 
 def _by_tracks(tracks: FeatureRays, centres: FloatArray, middle: FloatArray, reach: float) -> BoolArray:
-    """Return which photographs have a feature ray to a point within `reach` of each place, shape (g, photographs)."""
+    """Return whether each photograph has a feature ray to a point within `reach` of each place, (g, photographs)."""
     off, photograph = KDTree(centres).query(tracks.origins)
     own = np.asarray(off) <= 1e-3 * reach
     near = KDTree(middle).query_ball_point(tracks.points, reach)

@@ -1,4 +1,4 @@
-"""Backend fused: rendering by compiled kernels on the CPU, with row-sparse gradients."""
+"""Backend fused: rendering by compiled kernels on the CPU; its gradients are row-sparse tensors."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation one task sums
-FEWEST_SAMPLES = 24  # Mean number of samples per ray for which the first batch takes memory
-MOST_GROUPS = 1 << 12  # Most groups of voxels by which samples are put in order (one group more may occur)
+FEWEST_SAMPLES = 24  # Mean number of samples per ray for which the first batch allocates memory
+MOST_GROUPS = 1 << 12  # Most groups of voxels by which samples are sorted (one group more may occur)
 RANGES_PER_THREAD = 4  # Ranges of rows per thread over which gradients are summed
 VARIATION_SHARE = 0.02  # Work for the variation of one channel in one voxel, relative to the work for one sample
 _room: dict[int, int] = {}
-"""Samples per ray for which the last batch took memory, by the number of rows of its grid."""
+"""Mean number of samples per ray for which the last batch allocated memory, by the number of rows of its grid."""
 NAMES = ("density", "sh", "temperature")
 
 
@@ -42,15 +42,12 @@ class RecordedSamples:
     settings: Settings
     records: Records
     sums: Sums
-    spans: list[tuple[int, int]]  # First and one behind the last used record of each range of rays
+    spans: list[tuple[int, int]]  # For each range of rays, its first record and its last record plus 1
 
 
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
-    """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read.
-
-    Raises:
-        ThermoxelsError: The density of a sample is NaN.
-    """
+    """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read. Raises
+    `ThermoxelsError` if the density of a sample is NaN."""
     nothing = torch.zeros(len(request.origins), dtype=torch.bool)
     recorded = _recorded_samples(grid, None, replace(request, rgb_rays=nothing, thermal_rays=nothing), options)
     records = recorded.records
@@ -66,7 +63,7 @@ def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Gri
 def _recorded_samples(
     grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
 ) -> RecordedSamples:
-    """Run the forward pass for rays through a grid; `sh` is its colour, or None to leave colour out."""
+    """Return the forward pass of rays through a grid; `sh` is the grid's colour, or None to leave colour out."""
     density = grid.density.detach().numpy()
     voxels, dtype, lattice = grid.voxels, density.dtype, grid.lattice
     volume = Volume(
@@ -106,7 +103,9 @@ def _recorded_samples(
 
 
 def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, Sums, list[tuple[int, int]]]:
-    """Fill `sums` and return the records of the samples; repeat with twice as many while the records do not suffice."""
+    """Return the records of the samples, `sums`, which is filled in place, and `RecordedSamples.spans`. While the
+    memory for records does not suffice, the pass is repeated with twice as much. Raises `ThermoxelsError` if the
+    density of a sample is NaN."""
     count, rows, dtype = len(rays.origins), len(volume.density), volume.density.dtype
     while True:
         room = _room.get(rows, FEWEST_SAMPLES)
@@ -138,11 +137,8 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
-    """Return what rays see of a grid on the CPU; the result can be differentiated once, by the grid's parameters.
-
-    Raises:
-        ThermoxelsError: The density of a sample is NaN.
-    """
+    """Return what rays see of a grid on the CPU. The result can be differentiated once, with respect to the grid's
+    parameters. Raises `ThermoxelsError` if the density of a sample is NaN."""
     out = _Render.apply(grid.density, grid.sh, grid.temperature, grid, request, options)
     assert isinstance(out, tuple)
     rgb, thermal, transmittance, accumulation, depth, distortion, *variation = out
@@ -210,7 +206,8 @@ def _parameters(volume: Volume) -> dict[str, np.ndarray]:
 
 
 def _blocks(options: RenderOptions, volume: Volume) -> Iterator[tuple[str, tuple[int, int], int, float]]:
-    """Yield parameter, (first, last), divisor for the mean total variation, and its part of channels not stored."""
+    """Yield name, (first, last), divisor and summand of each block of voxels whose mean total variation is wanted. The
+    mean is the sum over the block / divisor + summand; the summand is the part of channels that are not stored."""
     for name, (first, last) in options.variation.items():
         columns = _parameters(volume)[name].shape[1]
         channels = columns if name != "sh" or options.colour_channels is None else options.colour_channels
@@ -219,7 +216,7 @@ def _blocks(options: RenderOptions, volume: Volume) -> Iterator[tuple[str, tuple
 
 
 def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, last: int) -> float:
-    """Return the total variation summed over voxels `first` to before `last`; no bit depends on the thread count."""
+    """Return `kernels_backward.total_variation`, summed in parallel; no bit depends on the number of threads."""
     bounds = [*range(first, last, VOXELS_AT_ONCE), last]
     parts: Any = run_tasks(
         [
@@ -239,7 +236,8 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
 
 
 def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
-    """Return the gradients of density, colour and temperature as row-sparse tensors; None if no row has one."""
+    """Return the gradients with respect to density, colour and temperature as three row-sparse tensors. They are the
+    sums of the gradients of samples and of total variation; None in place of a tensor without rows."""
     parameters, num_rows = list(_parameters(volume).values()), len(volume.density)
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])
@@ -278,7 +276,7 @@ def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, block
 
 
 def _ordered(samples: SampleGradients, voxels: int) -> Order:
-    """Return the samples with a gradient in the order of their groups of voxels."""
+    """Return the samples with a gradient, sorted by groups of voxels; `voxels` is the number of kept voxels."""
     total = int(samples.used.sum())
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
@@ -288,7 +286,8 @@ def _ordered(samples: SampleGradients, voxels: int) -> Order:
 
 
 def _row_ranges(voxel_rows: np.ndarray, num_rows: int, order: Order, blocks: Blocks, channels: list[int]) -> list[int]:
-    """Return the bounds of ranges of rows with about equal work, ascending, from 0 to `num_rows`."""
+    """Return the bounds, ascending from 0 to `num_rows`, of ranges of rows with about equal work for gradients.
+    `channels` are the numbers of columns of density, colour and temperature."""
     ranges = num_threads() * RANGES_PER_THREAD
     if num_threads() == 1 or len(voxel_rows) == 0:
         return [0, num_rows]

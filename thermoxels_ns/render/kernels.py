@@ -1,4 +1,4 @@
-"""Compiled forward pass: follow rays through kept voxels, weigh the samples by density, sum colour and temperature."""
+"""Compiled forward pass: follow rays through kept voxels, compute sample weights, sum colour and temperature."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from thermoxels_ns.core.kernel_cache import kernel
 
 
 def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
-    """Return how numba compiles `prefetch`, which loads ``array[row, column]`` (1-D: ``array[row]``) into the cache.
-
-    The call is a hint: no result depends on it, and an index outside the array does no harm.
-    """
+    """Return signature and code generator, for numba, of `prefetch`: load ``array[row, column]`` into the cache. For a
+    1-D array, ``array[row]`` is loaded. No result depends on the call, and an index out of range does no harm."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array_type = signature.args[0]
@@ -91,10 +89,8 @@ class Settings(NamedTuple):
 
 
 class Records(NamedTuple):
-    """One record per sample in a kept voxel, ray after ray; a ray has no records behind `Settings.early_stop`.
-
-    Each range of rays has a part of the arrays for itself, so unused records may lie between ranges.
-    """
+    """One record per sample in a kept voxel, ray after ray; a ray has none behind its stop by `Settings.early_stop`.
+    Each range of rays has a part of the arrays for itself, so unused records may lie between ranges."""
 
     offset: Ints  # First record of each ray, (rays,) int64
     used: Ints  # Number of records of each ray, (rays,) int64
@@ -109,15 +105,15 @@ class Records(NamedTuple):
 
 
 class SampleGradients(NamedTuple):
-    """Gradients of the loss for each recorded sample; three arrays reuse the memory of arrays of `Records`."""
+    """Gradients of the loss with respect to values of each sample; three arrays reuse the memory of `Records`."""
 
     offset: Ints  # This and the next three are the arrays of `Records` of that name
     used: Ints
     number: Ints
     fraction: Floats
-    raw_density: Floats  # For the raw density, (records,); overwrites `Records.density`
-    temperature: Floats  # For the temperature, (records,); overwrites `Records.transmittance`
-    logits: Floats  # For the colour before the sigmoid, (records, 3); overwrites `Records.rgb`
+    raw_density: Floats  # Gradient for the raw density, (records,); overwrites `Records.density`
+    temperature: Floats  # Gradient for the temperature, (records,); overwrites `Records.transmittance`
+    logits: Floats  # Gradient for the colour before the sigmoid, (records, 3); overwrites `Records.rgb`
     uses: Ints  # Gradients that a sample has, (records,) uint8: bits DENSITY, COLOUR, TEMPERATURE
 
 
@@ -134,7 +130,7 @@ class Sums(NamedTuple):
 
 @kernel
 def chord(rays: Rays, r: int, volume: Volume):
-    """Return where ray `r` enters and leaves the box, as distances; 0, 0 for a miss (as `reference.intersect_box`)."""
+    """Return the distances at which ray `r` enters and leaves the box (see `reference.intersect_box`); a miss: 0, 0."""
     enter, leave = float(rays.near[r]), float(rays.far[r])
     for axis in range(3):
         origin, direction = float(rays.origins[r, axis]), float(rays.directions[r, axis])
@@ -156,7 +152,7 @@ def chord(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def path_of(rays: Rays, r: int, volume: Volume):
-    """Return origin, direction, and 1 / direction of ray `r`, three numbers each; 1e200 stands for 1 / 0."""
+    """Return origin, direction and 1 / direction of ray `r`, three numbers each; 1e200 replaces 1 / 0."""
     never = 1e200
     dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
     ix, iy = 1.0 / dx if abs(dx) > 1e-100 else never, 1.0 / dy if abs(dy) > 1e-100 else never
@@ -166,11 +162,10 @@ def path_of(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
-    """Find the first sample of a ray, from step `i` on, that lies in a kept voxel.
-
-    `path` is the ray as `path_of` returns it; the ray enters the box at distance `enter` and crosses `length` of it.
-    Returns step, number of the voxel, distance, length of the step, and place (x, y, z) in the voxel; step -1: none.
-    """
+    """Return the first sample of a ray, from step number `i` on, that lies in a kept voxel. The ray `path`, from
+    `path_of`, enters the box at distance `enter` and has `length` in it; steps have length `step`. Returns number of
+    the step (-1: no sample), number of the voxel, distance, length of the step, and place (x, y, z) in the voxel, each
+    0 to 1."""
     (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
     h = volume.size
@@ -220,7 +215,7 @@ def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats
 
 @kernel(fastmath={"contract"})
 def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, into: Floats):
-    """Write into `into` all channels of `values` at the place (fx, fy, fz) in a voxel; arguments as of `gather_one`."""
+    """Write all channels of `values` at a place in a voxel to `into` (channels,); see `gather_one` for arguments."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
     one = values.dtype.type
@@ -236,7 +231,8 @@ def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: fl
 
 @kernel(fastmath={"contract"})
 def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, k: int):
-    """Return channel `k` of `values` at (fx, fy, fz), each 0 to 1, in voxel `number`; `rows` is `Volume.voxel_rows`."""
+    """Return channel `k` of `values` (rows, channels), interpolated at (fx, fy, fz), each 0 to 1, in voxel `number`.
+    `rows` is `Volume.voxel_rows`."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b = np.uint64(rows[number, 0]), np.uint64(rows[number, 1])
     c, d = np.uint64(rows[number, 2]), np.uint64(rows[number, 3])
@@ -252,7 +248,7 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
 
 @kernel
 def prefetch_corners(values: Floats, rows: Ints, number: int):
-    """Load the first channel of `values` at the corners of voxel `number` into the cache, as `prefetch_colours`."""
+    """Load the first channel of `values` at the corners of voxel `number` into the cache; see `prefetch_colours`."""
     for corner in range(4):
         row = np.int64(rows[number, corner])
         prefetch(values, row, 0)
@@ -260,7 +256,7 @@ def prefetch_corners(values: Floats, rows: Ints, number: int):
 
 @kernel
 def place_of(records: Records, n: int):
-    """Return the place of record `n` in its voxel: x, y and z, each from 0 to 1."""
+    """Return the place of the sample of record `n` in its voxel: x, y and z, each from 0 to 1."""
     return float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
 
 
@@ -286,14 +282,11 @@ def march_rays(
     begin: int,
     end: int,
 ):
-    """Weigh the samples of rays `first` to before `last` (paper, eq. 1); fill records from `begin` to before `end`.
-
-    Fills all of `sums` but colour and temperature, in double precision. Threads share a batch: each has a range of
-    rays and a range of records. `AHEAD` samples are read together, so that their loads from memory overlap.
-
-    Returns:
-        Number of rays with a NaN density (-1 if the records do not suffice), and the place behind the last record.
-    """
+    """Compute the weights of the samples of rays `first` to before `last` (paper, eq. 1). Writes records `begin` to
+    before `end`, and all of `sums` but colour and temperature, which are summed in double precision. Returns the number
+    of rays with a NaN density and the index behind the last record written. The number is -1 if there are too few
+    records. Threads share a batch: each has a range of rays and a range of records. `AHEAD` samples are read together,
+    so that their loads from memory overlap."""
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
     n = begin
@@ -372,10 +365,9 @@ def prefetch_colours(values: Floats, rows: Ints, number: int):
 
 @kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
-    """Sum colour and temperature of rays `first` to before `last` into `sums` (paper, eq. 1 and 2).
-
-    A ray that does not want a value gets 0. Samples of at most `Settings.smallest_weight` are left out.
-    """
+    """Write colour and temperature of rays `first` to before `last` to `sums` (paper, eq. 1 and 2). The samples' own
+    values are written to `records`, which `march_rays` must have filled. A ray that does not want a value gets 0.
+    Samples of at most `Settings.smallest_weight` are left out."""
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3
     one = volume.density.dtype.type

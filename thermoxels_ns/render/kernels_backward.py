@@ -1,4 +1,4 @@
-"""Compiled backward pass: from the gradients of rays to those of their samples, which are summed for each row."""
+"""Compiled backward pass: from gradients for rays to gradients for their samples, which are summed for each row."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from thermoxels_ns.render.kernels import (
 )
 
 _FLAT_EXP = math.exp(EXP_LIMIT) * (1.0 - 1e-6)
-"""Density at which `exp` has become constant, less 1e-6 of it: densities are rounded to single precision."""
+"""Density from which the activation `exp` is constant, times 1 - 1e-6: densities are rounded to single precision."""
 NEAR, FAR = 8, 16
 """Sums are prefetched NEAR samples ahead, the places of sums FAR samples ahead, and records 2 FAR samples ahead."""
 
 
 class RayGradients(NamedTuple):
-    """Gradients of the loss for the results of each ray; the shapes are those of `kernels.Sums`."""
+    """Gradients of the loss with respect to the results of each ray; the shapes are those of `kernels.Sums`."""
 
     rgb: Floats
     thermal: Floats
@@ -57,12 +57,11 @@ def find_sample_gradients(
     depth: Floats,
     samples: SampleGradients,
 ):
-    """Write the gradients of the samples of rays `first` to before `last` into `samples`, which overwrites `records`.
-
-    With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
-    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end. The `depth` (rays,)
-    of a ray is d = sum_i w_i t_i / sum_i w_i, so that it adds dL/dd (t_i - d) / sum_j w_j to g_i.
-    """
+    """Write the gradients for the samples of rays `first` to before `last` to `samples`, which overwrites `records`.
+    `grads` are the gradients for the results of the rays, and `depth` (rays,) is `Sums.depth`. With x_i the optical
+    depth of step i, w_i = T_i (1 - exp(-x_i)) and T_{i+1} = T_i exp(-x_i), the gradient is dL/dx_i = g_i T_{i+1} -
+    sum_{j>i} g_j w_j - g_T T_end, with g_i = dL/dw_i and g_T = dL/dT_end. The depth of a ray is d = sum_i w_i t_i /
+    sum_i w_i, so that it adds dL/dd (t_i - d) / sum_j w_j to g_i."""
     channels = volume.sh.shape[1]
     for r in range(first, last):
         start, used = records.offset[r], records.used[r]
@@ -146,16 +145,16 @@ class Blocks(NamedTuple):
     """Blocks of voxels whose total variation has a gradient: one each for density, colour and temperature."""
 
     first: Ints  # Number of the first voxel of each block, (3,) int64
-    last: Ints  # One behind the last voxel of each block, (3,) int64; equal to `first` where there is no block
-    push: Floats  # Gradient of the loss for the `total_variation` of each block, (3,) float64
+    last: Ints  # Number of the last voxel of each block plus 1, (3,) int64; equal to `first` if there is no block
+    push: Floats  # Gradient of the loss with respect to the `total_variation` of each block, (3,) float64
     smallest: float  # Number added under the root of the total variation
 
 
 class RowGradients(NamedTuple):
-    """Sums of gradients by row (corner) of a `Volume`; the last three arrays hold only rows that have a gradient."""
+    """Sums of gradients by row (corner) of a `Volume`; the last three arrays have only the rows with a gradient."""
 
     uses: Ints  # Parameters that have a gradient at each row, (rows,) uint8: bits DENSITY, COLOUR, TEMPERATURE
-    place: Ints  # Where each row's sum lies in `density`, `sh` and `temperature`, (rows, 3) int32; else undefined
+    place: Ints  # Index of each row's sum in `density`, `sh`, `temperature`, (rows, 3) int32; undefined without a sum
     density: Floats  # (rows with a gradient of density, 1)
     sh: Floats  # (rows with a gradient of colour, columns)
     temperature: Floats  # (rows with a gradient of temperature, columns)
@@ -184,7 +183,8 @@ def order_samples(samples: SampleGradients, order: Order):
 
 @kernel
 def first_voxel(voxel_rows: Ints, corner: int, row: int):
-    """Return the first voxel n with `voxel_rows[n, corner]` of at least `row`; the columns of `voxel_rows` ascend."""
+    """Return the first voxel n with ``voxel_rows[n, corner] >= row``, or the number of voxels if there is none. The
+    column `corner` (0 to 3) of `voxel_rows` must ascend, as in `KeptVoxels`."""
     low, high = 0, len(voxel_rows)
     while low < high:
         middle = (low + high) >> 1
@@ -199,7 +199,7 @@ def first_voxel(voxel_rows: Ints, corner: int, row: int):
 def use_rows(
     first_row: int, last_row: int, volume: Volume, samples: SampleGradients, order: Order, blocks: Blocks, uses: Ints
 ):
-    """Write the bits of `RowGradients.uses` for rows `first_row` to before `last_row` into `uses`."""
+    """Write `RowGradients.uses`, for samples and variation, of rows `first_row` to before `last_row` to `uses`."""
     rows = volume.voxel_rows
     uses[first_row:last_row] = 0
     begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
@@ -227,7 +227,9 @@ def _groups_before(number: int, order: Order):
 
 @kernel
 def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
-    """Write rows of a range with a gradient of parameter `kind` (0 to 2) to `listed[at:]`; set their `sums` to 0."""
+    """Give each row from `first_row` to before `last_row` with a gradient for parameter `kind` a place in `sums`.
+    `kind` is 0, 1 or 2 for density, colour or temperature. Places are successive from `at` on. They are written to
+    `rows.place`, the numbers of the rows to `listed`, and 0 to `sums` (places, columns)."""
     for row in range(first_row, last_row):
         if rows.uses[row] & (1 << kind):
             rows.place[row, kind], listed[at] = at, row
@@ -247,7 +249,7 @@ def prefetch_sample(samples: SampleGradients, n: int):
 
 @kernel
 def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
-    """Load the gradient sums at the corners of voxel `number` into the cache; for other threads' rows it is no use."""
+    """Load the gradient sums at the corners of voxel `number` into the cache; useless for rows of other threads."""
     for corner in range(4):
         row = voxel_rows[number, corner]
         prefetch(rows.density, rows.place[row, 0], 0)
@@ -257,7 +259,7 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
 
 @kernel
 def corner_shares(samples: SampleGradients, n: int, shares: Floats):
-    """Write the trilinear weights of the corners around sample `n` to `shares` (8,), in order of `CORNER_OFFSETS`."""
+    """Write the trilinear weights of the corners at sample `n`, in order of `CORNER_OFFSETS`, to `shares` (8,)."""
     one = shares.dtype.type(1.0)
     fx, fy, fz = samples.fraction[n, 0], samples.fraction[n, 1], samples.fraction[n, 2]
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -276,10 +278,9 @@ def add_samples(
     order: Order,
     rows: RowGradients,
 ):
-    """Add the gradients of samples, in the order of `order`, to the sums of rows `first_row` to before `last_row`.
-
-    No other thread adds to these rows, so the sums have the same bits for any number of threads.
-    """
+    """Add the gradients of samples, in the sequence of `order`, to the sums in `rows`. Only sums of the rows
+    `first_row` to before `last_row` are changed. As no other thread adds to these rows, the sums have the same bits for
+    any number of threads."""
     count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
     dtype = volume.density.dtype
     basis, thermal_basis = np.empty(9), np.empty(9)
@@ -338,7 +339,9 @@ def add_samples(
 
 @kernel(fastmath={"contract"})
 def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
-    """Return the sum of sqrt(dx^2 + dy^2 + dz^2) over voxels `first` to before `last` and all channels of `values`."""
+    """Return the sum of sqrt(dx^2 + dy^2 + dz^2 + smallest) over voxels `first` to before `last` and all channels. dx,
+    dy, dz are the differences of `values` (rows, channels) between a voxel's lowest corner and the corners one step
+    along x, y, z. These rows are columns 0, 2 and 1 of `voxel_rows`, and column 0 plus 1 for z (see `KeptVoxels`)."""
     channels = values.shape[1]
     tiny = values.dtype.type(smallest)
     totals = np.zeros(channels)
@@ -366,7 +369,9 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the total variation's gradient for parameter `kind` to `gradient`, rows `first_row` to before `last_row`."""
+    """Add the gradient of the loss by total variation, with respect to the parameter `values`, to `gradient`. `kind` is
+    0, 1 or 2 for density, colour or temperature. The rows are `first_row` to before `last_row`; the sum of a row lies
+    in ``gradient[place[row, kind]]``. See `total_variation` for `values` and `voxel_rows`."""
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type

@@ -19,7 +19,7 @@ class RayRequest:
     directions: Float[Tensor, "rays 3"]  # Unit vectors
     near: float | Float[Tensor, " rays"] = 0.0  # Distance where sampling starts, world units
     far: Float[Tensor, " rays"] | None = None  # Distance where sampling ends, world units; None: behind the grid
-    rgb_rays: Bool[Tensor, " rays"] | None = None  # True for rays that want colour, others get 0; None: all want it
+    rgb_rays: Bool[Tensor, " rays"] | None = None  # True: the ray wants colour; False: it gets 0; None: all want it
     thermal_rays: Bool[Tensor, " rays"] | None = None  # The same for temperature
 
     def near_and_far(self) -> tuple[Tensor, Tensor]:
@@ -31,15 +31,15 @@ class RayRequest:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of a renderer: the values that it computes, and how exactly."""
+    """Options of a renderer, which say what it computes and with which tolerances."""
 
     steps_per_voxel: float = 2.0  # Samples per voxel edge along a ray
     smallest_weight: float = 0.0
     """Samples of at most this weight add no colour and no temperature; the error of a pixel is at most this weight
     times its number of samples. 0 is exact."""
     early_stop: float = 0.0
-    """A ray ends when less than this share of its light is left; its pixel, accumulation and weights are off by at
-    most this much. 0: never. (The backend reference ignores it and follows each ray to its end.)"""
+    """A ray ends when less than this share of its light is left, so that its pixel, accumulation and weights are off by
+    at most this much. 0: it does not end. The backend reference ignores this option and follows rays to their ends."""
     thermal_moves_density: bool = False  # True: density gets a gradient from temperature
     distortion_scale: float | None = None
     """Length that counts as 1 in the distortion of each ray, world units; None: no distortion is computed."""
@@ -47,7 +47,7 @@ class RenderOptions:
     """Number of channels over which the total variation of colour is averaged; channels that the grid does not store
     yet count as 0. None: the stored channels."""
     variation: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Blocks of kept voxels whose total variation is computed, by parameter: first number, and one behind the last."""
+    """By parameter name, the first number and the last number plus 1 of the kept voxels with total variation."""
 
 
 @dataclass(frozen=True)

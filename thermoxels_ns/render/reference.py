@@ -24,10 +24,11 @@ def intersect_box(
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"], Bool[Tensor, " rays"]]:
-    """Return where rays enter and leave an axis-aligned box, world units, and whether they hit it; (rays,) each.
+    """Return the distances at which rays enter and leave an axis-aligned box, [world units], and whether they hit it.
 
-    By slabs (Kay and Kajiya 1986): a ray parallel to a slab (direction below 1e-20) misses the box if its origin lies
-    outside that slab. Only the part of a ray from `near` to `far` counts; both distances of a miss are 0.
+    All three have shape (rays,). Only the part of a ray from `near` to `far` (None: infinity) counts; a ray that misses
+    the box has distances 0. This is the slab method (Kay and Kajiya 1986): a ray parallel to a slab (component of the
+    direction below 1e-20) misses the box if its origin lies outside that slab.
     """
     parallel = directions.abs() < 1e-20
     inverse = 1.0 / torch.where(parallel, torch.ones_like(directions), directions)
@@ -51,14 +52,10 @@ SMALLEST_VARIATION = 1e-10  # Number added under the root of the total variation
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> tuple[Tensor, Tensor]:
     """Return the weights w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) and the optical depth sum_i s_i d_i of rays.
 
-    Densities s, lengths d and weights have shape (rays, steps), optical depths (rays,).
-
-    This is eq. 1 of the paper, with s in 1 / world unit. Weights and exp(-optical depth) of a ray sum to 1. An infinite
-    density is opaque, but a step of length 0 has no weight. Optical depths are summed and 1 - exp(-x) is -expm1(-x), so
-    that neither opaque rays nor small densities lose digits.
-
-    Raises:
-        ThermoxelsError: A density is NaN.
+    This is eq. 1 of the paper. Densities s, [1 / world unit], lengths d and weights have shape (rays, steps); optical
+    depths have shape (rays,). Weights and exp(-optical depth) of a ray sum to 1. An infinite density is opaque, but a
+    step of length 0 has no weight. Neither opaque rays nor small densities lose digits, because optical depths are
+    summed and 1 - exp(-x) is computed as -expm1(-x). Raises `ThermoxelsError` if a density is NaN.
     """
     if torch.isnan(density).any():
         remedy = "Lower the density learning rate and resume from the last checkpoint."
@@ -80,8 +77,9 @@ def ray_distortion(
 ) -> Float[Tensor, " rays"]:
     """Return the distortion of each ray: sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i (mip-NeRF 360, eq. 15).
 
-    Distortion is small where the weight of a ray lies in one short interval. `t` must ascend along each ray; `t` and
-    `deltas` are divided by `scale`, world units. The sum is computed in the O(n) form of DVGOv2, eq. 6-7.
+    t_i is the distance and d_i the length of step i, both divided by `scale`; all three are in world units. The caller
+    must pass ascending `t` along each ray. Distortion is small if the weight of a ray lies in one short interval. The
+    sum is computed in the O(n) form of DVGOv2, eq. 6-7.
     """
     t, deltas = t / scale, deltas / scale
     moment = weights * t
@@ -93,10 +91,8 @@ def ray_distortion(
 
 @dataclass(frozen=True)
 class Marched:
-    """Samples of rays through the box, one in the middle of each step, with their weights.
-
-    The lengths of a ray's steps sum to its length inside the box; shorter rays are padded with steps of length 0.
-    """
+    """Samples of rays through the box, one in the middle of each step, with their weights. The lengths of a ray's steps
+    sum to its length inside the box. Rays with fewer steps get steps of length 0 behind."""
 
     t: Float[Tensor, "rays steps"]  # Distance of each sample from the ray origin, world units
     deltas: Float[Tensor, "rays steps"]  # Length of each step, world units
@@ -108,7 +104,7 @@ class Marched:
 
 
 def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
-    """Return the samples of rays through a grid with their weights."""
+    """Return samples at equal steps along rays through a grid, with their weights."""
     origins, directions, lattice = request.origins, request.directions, grid.lattice
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
@@ -136,7 +132,7 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
     weight = weights.flatten()[marched.active]
 
     def summed(values_at: Callable[..., Tensor], wants: Tensor | None, weight: Tensor, channels: int) -> Tensor:
-        """Return sum_i w_i c_i of each ray that wants the value, over samples above the smallest weight; else 0."""
+        """Return sum_i w_i c_i over samples above the smallest weight of each ray that wants the value, else 0."""
         chosen = weight.detach() > options.smallest_weight
         chosen = (chosen if wants is None else chosen & wants[ray]).nonzero()[:, 0]
         values = values_at(marched.at.select(chosen), request.directions[ray[chosen]]) * weight[chosen][:, None]
@@ -180,9 +176,9 @@ def total_variation(
 ) -> Float[Tensor, ""]:
     """Return the mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4).
 
-    dx, dy, dz are differences from corner 0 of a voxel. `corners` holds the rows of each voxel's corners, in the order
-    of `lattice.CORNER_OFFSETS`. The mean is over `channels` (default: the columns of `rows`); channels without a
-    column count as 0.
+    dx, dy, dz are the differences of `rows` between corner 0 of a voxel and its neighbours along x, y, z. `corners` has
+    the rows of each voxel's corners in the order of `lattice.CORNER_OFFSETS`. The mean is over `channels` channels
+    (None: the columns of `rows`); channels without a column are 0 everywhere.
     """
     columns = rows.shape[1]
     channels = columns if channels is None else channels

@@ -24,7 +24,8 @@ LEAST_LIGHT = 0.003  # The surroundings of a ray are rendered if more than this 
 
 
 def choose_backend(backend: Backend, device: torch.device) -> Literal["reference", "fused"]:
-    """Return the backend to use; auto is fused on a CPU. Raise `ThermoxelsError` for fused on another device."""
+    """Return the backend for a device: auto is fused on a CPU, else reference. Raise `ThermoxelsError` for fused on
+    another device than a CPU."""
     if backend == "fused" and device.type != "cpu":
         remedy = "Pass --pipeline.model.backend auto, or --machine.device-type cpu."
         got = "fused, whose kernels run on the CPU"
@@ -66,7 +67,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class AroundRender:
-    """Rendered rays through the surroundings; a ray that lost nearly all light in the box has 0 and transmittance 1."""
+    """Rendered rays through the surroundings; a ray that lost nearly all light in the box: sums 0, transmittance 1."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
@@ -85,7 +86,8 @@ class SceneRender:
 
 
 def split_render(requests: Sequence[RayRequest], render: Callable[[RayRequest], SceneRender]) -> list[SceneRender]:
-    """Render the rays of several requests in one call of `render`, and return what those of each see."""
+    """Return the results of several requests, of which `render` renders all rays in one call. Each result has the rays
+    of its own request, and the total variation of the whole call."""
     ends = [request.near_and_far() for request in requests]
     counts = [len(request.origins) for request in requests]
     every = torch.ones(sum(counts), dtype=torch.bool, device=requests[0].origins.device)
@@ -105,7 +107,7 @@ def split_render(requests: Sequence[RayRequest], render: Callable[[RayRequest], 
 
 
 def _rays_of(result: Any, part: slice) -> Any:
-    """Return a result of rendering with some of its rays only."""
+    """Return a result of rendering (a dataclass) with only the rays of the slice `part`."""
     cut = {}
     for name, value in vars(result).items():
         if isinstance(value, Tensor):
@@ -122,10 +124,8 @@ def render_scene(
     backend: Backend,
     variation: dict[str, tuple[int, int]] | None = None,
 ) -> SceneRender:
-    """Return what rays see of box, surroundings and infinity; a ray that does not want a value gets 0.
-
-    `variation` is `RenderOptions.variation` for the grid of the surroundings; `options` is for the box.
-    """
+    """Return what rays see of box, surroundings and infinity; a ray that does not want a value gets 0. `options` are
+    for the grid in the box. `variation` is `RenderOptions.variation` for the grid of the surroundings."""
     box = render_rays(scene.grid, request, options, backend)
     around = None
     if scene.surroundings is not None:

@@ -1,4 +1,4 @@
-"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds, tell its progress."""
+"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds, print progress."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_ra
 FEWEST_OPEN_RAYS = 0.002  # A background stays if at least this share of rays leaves the box with half of its light
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
-MOST_OPENED_RAYS = 0.01  # Of the rays of opacity above one half, the largest share that pruning may open
-OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which the voxel counts as opaque: half of the light is lost
-PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # A line of progress at each such part of the steps, or after so long
+MOST_OPENED_RAYS = 0.01  # Largest share, of the rays of opacity above one half, that pruning may open
+OPAQUE_DEPTH = 0.7  # Least optical depth across an opaque voxel: half of the light is lost
+PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # Number of lines of progress; a line comes at least this often
 PRUNING_ATTEMPTS = 4  # Number of thresholds tried before pruning fails
 RAYS_PER_IMAGE = 4096  # Training rays per image from which statistics are made
 SHORTEST_RUN_WITH_DEPTHS = 400
@@ -59,7 +59,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
     def carve(step: int) -> None:
-        """Drop the voxels of the box that are air, see `ThermoxelsModelConfig.carve`."""
+        """Drop voxels of the box that are air, or that fewer than two photographs show (`carve` in the settings)."""
         if model.config.carve == "off" or rays is None:
             return
         assert attributes.pipeline is not None
@@ -76,7 +76,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(prune(model.grid, ~air))
 
     def follow(change: GridChange, grid: VoxelGrid = model.grid, prefix: str = "") -> None:
-        """Give the optimisers the new parameters of `grid`, and change their state by `change`."""
+        """Give the optimisers `prefix` + name the new parameters of `grid`, and change their state by `change`."""
         assert attributes.optimizers is not None
         for name, new in grid.row_parameters().items():
             (old,) = attributes.optimizers.parameters[prefix + name]
@@ -86,7 +86,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
                 attributes.optimizers.parameters[prefix + name] = [new]
 
     def change_surroundings(step: int) -> None:
-        """Drop voxels of the surroundings by `prune_threshold` (at step 0: by 0); split the others at a refinement."""
+        """Drop voxels of the surroundings with no weight above `prune_threshold` (step 0: above 0); refine the rest."""
         if model.seen_surroundings is None:
             return
         assert attributes.pipeline is not None
@@ -139,7 +139,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             carve(step)
 
     def widen(step: int) -> None:
-        """Let the grid store all harmonics of colour once their step is reached, and tell the optimiser."""
+        """From step `view_dependence_from` on, let grid and optimiser store all harmonics of colour."""
         stored, degree = model.grid.sh_degree, model.config.sh_degree
         if stored is None or degree is None or stored >= degree:
             return
@@ -158,10 +158,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
 
 def progress(first: int, end: int) -> Callable[[int], None]:
-    """Return a function to call after each step from `first` to before `end`, which prints a line of progress at times.
+    """Return a function that prints progress; it must be called after each step from `first` to before `end`.
 
-    The line says how many steps are done and how long the others take at the pace since the line before. It comes at
-    each twentieth of the steps and after a minute without one, the same on a terminal and in a file.
+    A line comes at each twentieth of the steps and after a minute without a line, both on a terminal and in a file. It
+    states the steps done and the time that the others take at the pace since the line before.
     """
     said_s, said = time.monotonic(), first + 1
 
@@ -180,11 +180,11 @@ def progress(first: int, end: int) -> Callable[[int], None]:
 
 
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> FeatureRays | None:
-    """Find depths in photographs, if they are on and possible, and return the rays to all known points; None: no rays.
+    """Return the rays to all known points: points of structure from motion and depths of photographs; None: no rays.
 
-    Known are points of structure from motion and depths. The model gets feature rays to both, rays through a plain
-    backdrop or to a plain ceiling, and, unless the training is resumed, gains, offsets and first colours. See
-    `ThermoxelsModelConfig.photo_depth`; depths need photographs in training.
+    Depths are found only if `ThermoxelsModelConfig.photo_depth` allows it and photographs are trained on. The model
+    then gets feature rays to the depths too, and rays through a plain backdrop or to a plain ceiling. Unless the
+    training is resumed, it also gets gains, offsets and first colours.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
     tracks = model.feature_rays
@@ -220,15 +220,14 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
 
 
 def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, GridChange]:
-    """Drop all voxels but those to which some training ray of either stream gives more than `threshold` of its light.
+    """Drop voxels that training rays hardly use; return a sentence for the log and the change of rows.
 
-    Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would
-    open), kept voxels up to `dilation` voxels away, and opaque neighbours (the rays of statistics miss some voxels of a
-    fine surface, and each would be a hole). If this opens more than `MOST_OPENED_RAYS`, the threshold is divided by 4
-    and the pruning tried again. Returns a sentence for the log and the change of rows.
-
-    Raises:
-        PruningError: Even the lowest threshold would open more rays; the grid stays as it was.
+    A voxel is needed if some ray of either stream gives it more than `threshold` of its light, or if a ray of opacity
+    above one half completes half of its weight in it (else soft surfaces would open). Needed voxels, voxels up to
+    `dilation` voxels away from them, and opaque neighbours of them are kept: these rays miss some voxels of a fine
+    surface, and each would be a hole. If this opens more than the share `MOST_OPENED_RAYS` of the rays, the threshold
+    is divided by 4 and the pruning tried again. Raises `PruningError`, without a change of the grid, if even the last
+    of `PRUNING_ATTEMPTS` thresholds would open more.
     """
 
     def rays():

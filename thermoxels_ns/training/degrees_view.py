@@ -1,4 +1,4 @@
-"""Temperatures in the viewer: a picture with a legend in degrees and isotherms, and a reading where one clicks."""
+"""Temperatures in the viewer: a picture with a legend in degrees and isotherms, and a reading by a click."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _STEPS_OF_SLIDER = 200
 class DegreesView(nn.Module):
     """Controls of the viewer for temperatures: range of colours, isotherms, reading.
 
-    It is a module without parameters because nerfstudio looks for controls in the modules of a pipeline.
+    The class is a module, without parameters, because nerfstudio looks for controls in the modules of a pipeline.
 
     Args:
         temperatures: Range of the scene's temperatures, within which the sliders move.
-        read: Function of a ray's origin and unit direction, both (1, 3), to the temperature at its end, [degrees
+        read: Function from a ray's origin and direction, both (1, 3), to the temperature that it sees, [degrees
             Celsius], and its opacity, 0 to 1.
     """
 
@@ -83,7 +83,7 @@ class DegreesView(nn.Module):
 
 
 def _with_legend(colours: Float[Tensor, "h w 3"], low: float, high: float) -> Float[Tensor, "h w 3"]:
-    """Return a picture with a bar of the colours from `low` to `high`, and numbers beside it, over its right edge."""
+    """Return a picture whose right edge is covered by a colour bar from `low` to `high`, [degrees Celsius]."""
     height, width = colours.shape[:2]
     picture = Image.fromarray((colours.cpu().numpy() * 255.0).round().astype(np.uint8))
     letters, margin = max(height // 28, 8), height // 20

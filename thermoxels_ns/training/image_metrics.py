@@ -15,11 +15,11 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
-SATURATED = 0.99  # Value of a channel from which the pixel counts as saturated: the scene may have been brighter
+SATURATED = 0.99  # Least value of a saturated channel: the scene may have been brighter
 
 
 def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
-    """Return the peak signal-to-noise ratio of values in [0, 1], over `valid` entries, [dB]; at most 100."""
+    """Return the peak signal-to-noise ratio of values in [0, 1], [dB], at most 100, over entries True in `valid`."""
     squared = (predicted - target) ** 2
     mse = squared.mean() if valid is None else squared[valid].mean()
     return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
@@ -33,7 +33,7 @@ def psnr_of_blocks(
 ) -> float:
     """Return the `psnr` of both images after averaging over blocks of `side` x `side` pixels, [dB].
 
-    A block is the mean of its valid pixels; blocks without any are left out. The result is NaN if no pixel is valid.
+    A block is the mean of its valid pixels; blocks without valid pixels are left out. NaN if no pixel is valid.
 
     >>> fine = torch.tensor([[[0.0], [1.0]], [[1.0], [0.0]]])
     >>> round(psnr_of_blocks(torch.full((2, 2, 1), 0.6), fine, side=2), 3)  # pixels are 0.4 and 0.6 off, their mean 0.1
@@ -50,9 +50,9 @@ def psnr_of_blocks(
 
 
 def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, " 3"]:
-    """Return the gain of each channel, (3,), that best maps rendered to measured pixels, by a robust fit (Huber).
+    """Return the gain of each channel, (3,), with which rendered pixels best fit measured ones (robust, Huber).
 
-    Values that are `SATURATED` in the measured photograph do not count.
+    Values of at least `SATURATED` in the measured photograph do not count.
     """
     gain, weight = torch.ones(3, device=predicted.device), (target < SATURATED).to(predicted.dtype)
     for _ in range(8):
@@ -65,9 +65,9 @@ def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 def ssim(
     predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"], valid: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Return the structural similarity (Wang et al. 2004), with a Gaussian window of 11 pixels.
+    """Return the structural similarity (Wang et al. 2004) with a Gaussian window of 11 pixels.
 
-    Smaller images have a box window. With `valid`, the mean is over windows with valid pixels only; NaN without any.
+    Smaller images have a box window. The mean is over windows whose pixels are all valid; NaN without such a window.
     """
     side = min(11, *predicted.shape[:2])
     side -= 1 - side % 2
@@ -85,8 +85,8 @@ def hssim(
 ) -> float:
     """Return the heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
 
-    HSSIM is the mean of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4, over disjoint 4 x 4 windows with valid pixels
-    only. A window that is flat in both images counts 1. The result is NaN if there is no such window.
+    HSSIM is the mean of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4, over disjoint 4 x 4 windows whose pixels are
+    all valid; NaN without such a window. A window that is flat in both images counts 1.
     """
 
     def window_mean(image: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ def hssim(
 
 
 def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
-    """Return the valid pixels hotter than Otsu's threshold (Otsu 1979), or all valid pixels of a flat image."""
+    """Return the mask of valid pixels hotter than Otsu's threshold (1979), or of all valid pixels of a flat image."""
     values = temperature_c[valid]
     if values.numel() == 0:
         return valid

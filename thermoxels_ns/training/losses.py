@@ -13,11 +13,11 @@ from torch import Tensor
 from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays
 from thermoxels_ns.render.ray_render import RayRequest
 
-LARGEST_ERROR = 0.25  # A point outside the box counts if `MARGIN_ERRORS` errors are a smaller share of a ray's length
+LARGEST_ERROR = 0.25  # Points outside the box count if `MARGIN_ERRORS` errors are less than this share of the length
 COARSE_LIGHT = 0.5
 """Share of the light that may pass a depth found in photographs while the lattice is coarse: an opaque coarse voxel
-reaches beyond the surface in it and hides things beside that surface. Through points of structure from motion no light
-may pass: these points are fewer, and rooms would keep more floaters."""
+reaches beyond the surface in it and hides things beside that surface. No light may pass points of structure from
+motion: these are fewer, and rooms would keep more floaters."""
 
 
 def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
@@ -26,13 +26,13 @@ def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> F
 
 
 def thermal_loss(predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"]) -> Float[Tensor, ""]:
-    """Return half of L2 plus half of L1 of normalised temperature (paper, eq. 4, where lambda = 1/2)."""
+    """Return half of the mean squared plus half of the mean absolute error (paper, eq. 4 with lambda = 1/2)."""
     error = predicted - target
     return 0.5 * torch.mean(error**2) + 0.5 * torch.mean(error.abs())
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
-    """Draw a random block of kept voxels, about `share` of all `voxels`; return its first number and its last plus 1.
+    """Return the first number and the last number plus 1 of a random block of about `share` of all kept `voxels`.
 
     Kept voxels are numbered slab by slab along x, so that a block is contiguous in space too.
     """
@@ -42,7 +42,7 @@ def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
-    """Return the mean of log(A + guard) + log(1 - A + guard), shifted to be 0 for opacities A of 0 or 1.
+    """Return the mean of log(A + guard) + log(1 - A + guard) over opacities A, shifted to be 0 for A of 0 or 1.
 
     This term pushes rays to be opaque or empty (Neural Volumes; Plenoxels).
     """
@@ -51,12 +51,12 @@ def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Floa
 
 
 class FeatureRaySampler:
-    """Draws rays to points that photographs see, for the loss that is 0 where the surface lies at these points.
+    """Sampler of random feature rays for `feature_ray_loss`, which is 0 if the surface lies at their points.
 
     Args:
-        rays: Feature rays, world units; at least one.
-        box: Lower and upper corner, (2, 3). A surface is expected at all points inside the box.
-        surroundings: True: a surface is expected outside, too, at points of known distance (`LARGEST_ERROR`).
+        rays: Feature rays, [world units]; at least one.
+        box: Lower and upper corner, (2, 3), [world units]. A surface is expected at all points inside the box.
+        surroundings: True: a surface is also expected at points outside whose distance is known (`LARGEST_ERROR`).
         coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
 
@@ -87,11 +87,11 @@ class FeatureRaySampler:
         device: torch.device,
         surroundings_step: float = 0.0,
     ) -> RayRequest:
-        """Return 2 `count` rays: random feature rays that end a margin before their points, then the same ones again.
+        """Return 2 `count` rays: `count` random feature rays that end a margin before their points, then the same rays,
+        ending a margin behind their points, or with length 0 if no surface is expected there.
 
-        In the second half, rays end a margin behind their points, or have length 0 where no surface is expected. The
-        rays want neither colour nor temperature. Lengths are in world units; the generator is on the CPU.
-        `surroundings_step` is `Surroundings.step`, or 0 without surroundings.
+        The rays want neither colour nor temperature. `near` and `voxel_size`, for the margin, are in world units;
+        `generator` must be on the CPU. `surroundings_step` is `Surroundings.step`, or 0 without surroundings.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = (
@@ -110,8 +110,8 @@ class FeatureRaySampler:
 def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
     """Return the mean share of light that feature rays lose before their points, plus the share that passes the points.
 
-    Both shares are 0 where the surface lies at the points. Inputs have shape (2 n,), one entry per ray of
-    `FeatureRaySampler.request`; of the light that passes a point the share `tolerated` does not count.
+    Both shares are 0 if the surface lies at the points. Opacity `accumulation` and `transmittance` have shape (2 n,),
+    one entry per ray of `FeatureRaySampler.request`. The share `tolerated` may pass a point without loss.
 
     >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355

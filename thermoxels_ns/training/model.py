@@ -66,10 +66,11 @@ class ThermoxelsModel(Model):
     temperature_bounds_c: Tensor  # Temperatures that stand for 0 and 1, (2,), [degrees Celsius]
     backdrop_on: Tensor  # Whether colour at infinity, temperature at infinity and surroundings are rendered, (3,)
     corrected: Tensor  # Whether gains and temperature offsets of training images are applied, (2,)
-    trained_steps: Tensor  # Step of training that was reached
+    trained_steps: Tensor  # Last step of training; kept because colour depends on the direction from some step on
 
     def populate_modules(self) -> None:
         """Build grid, surroundings, background and corrections; raise `SceneError` without a temperature range."""
+        # All buffers are kept in the checkpoint.
         super().populate_modules()
         self.config.check()
         box, metadata = self.scene_box.aabb.double().numpy(), self.kwargs.get("metadata") or {}
@@ -112,15 +113,12 @@ class ThermoxelsModel(Model):
         self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
         start = (*SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb)
         self.surroundings = Surroundings(torch.from_numpy(box), *start) if config.surroundings == "on" else None
-        # Whether colour at infinity, temperature at infinity and surroundings are rendered; kept in the checkpoint.
         on = [wants_rgb, self.background_thermal is not None, self.surroundings is not None]
         self.register_buffer("backdrop_on", torch.tensor(on))
         images, colour = self.num_train_data, config.sh_degree is not None and config.exposure != "off"
         self.log_gain = nn.Parameter(torch.zeros(images, 3)) if colour else None
         self.thermal_offset = nn.Parameter(torch.zeros(images)) if config.per_image_offset != "off" else None
-        # Whether gains and offsets are applied; kept in the checkpoint.
         self.register_buffer("corrected", torch.tensor([config.exposure == "on", config.per_image_offset == "on"]))
-        # Last step of training; kept in the checkpoint, because colour depends on the direction from some step on.
         self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
         # Rays from training photographs to the points of structure from motion.
@@ -134,12 +132,12 @@ class ThermoxelsModel(Model):
 
     @property
     def seen_surroundings(self) -> Surroundings | None:
-        """The surroundings that are rendered; None where everything outside the box lies at infinity."""
+        """The surroundings that are rendered; None: everything outside the box lies at infinity."""
         return self.surroundings if bool(self.backdrop_on[2]) else None
 
     @property
     def temperature_range(self) -> TemperatureRange:
-        """The temperatures for which normalised temperatures 0 and 1 stand, from the checkpoint if one was loaded."""
+        """The temperatures that are normalised to 0 and 1, from the checkpoint if one was loaded."""
         low, high = self.temperature_bounds_c.tolist()
         return TemperatureRange(low, high)
 
@@ -165,7 +163,7 @@ class ThermoxelsModel(Model):
     def _request(
         self, origins: Tensor, directions: Tensor, nears: Tensor | None = None, fars: Tensor | None = None
     ) -> RayRequest:
-        """Return a request for rays from `nears`, but at least the near plane, to `fars`, both (rays, 1)."""
+        """Return a request for rays from `nears` (at least the near plane; None: there) to `fars`, both (rays, 1)."""
         near: float | Tensor = self.config.near_plane * self.unit
         if nears is not None:
             near = nears[:, 0].clamp(min=near)
@@ -178,7 +176,7 @@ class ThermoxelsModel(Model):
         )
 
     def _training_options(self) -> RenderOptions:
-        """Return the options with which a training step renders: those of images and what the loss terms need."""
+        """Return the options of a training step: the options for images, and the values that loss terms need."""
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
@@ -187,7 +185,7 @@ class ThermoxelsModel(Model):
         )
 
     def _blocks(self, grid: VoxelGrid, stream: int) -> dict[str, tuple[int, int]]:
-        """Return the blocks of a grid whose total variation this step computes, by the name of the parameter."""
+        """Return by parameter name the random block of a grid's voxels whose total variation this step computes."""
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
             name: losses.random_block(len(grid.voxels), VARIATION_SHARE, generator)
@@ -197,10 +195,8 @@ class ThermoxelsModel(Model):
 
     @torch.no_grad()
     def correct_photographs(self, index: IntArray, log_gain: npt.NDArray | None, offset: npt.NDArray | None) -> None:
-        """Set the logarithmic gains (n, 3) and normalised offsets (n,) of the training images `index` (n,).
-
-        Other images keep 0. If `log_gain` or `offset` is None, these corrections stay as they are.
-        """
+        """Set the logarithmic gains (n, 3) and normalised offsets (n,) of the training images `index` (n,). Other
+        images keep 0. If `log_gain` or `offset` is None, these corrections stay as they are."""
         for number, (parameter, values) in enumerate(((self.log_gain, log_gain), (self.thermal_offset, offset))):
             if parameter is not None and values is not None:
                 parameter[torch.from_numpy(index)] = torch.from_numpy(values).to(parameter)
@@ -211,7 +207,7 @@ class ThermoxelsModel(Model):
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
     def sample_surroundings(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples in the surroundings; each straight piece of a ray counts as a ray, the box hides none."""
+        """Return the samples in the surroundings; each straight piece of a ray counts as a ray; the box hides none."""
         assert self.surroundings is not None
         cut = self.surroundings.segments(origins, directions)
         request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
@@ -228,7 +224,7 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Return what rays see: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1: meets box).
 
-        Rays of a batch carry their stream, see `core.feature_rays`; in training their outputs are the inputs of
+        For rays of a training batch, which carry their stream (see `core.feature_rays`), return the inputs of
         `get_loss_dict` instead. Rays are rendered from `nears` to `fars`, with which the viewer crops a scene.
         """
         request = self._request(ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars)
@@ -267,7 +263,7 @@ class ThermoxelsModel(Model):
         }
 
     def _correction(self, correction: Tensor, wanted: str) -> Tensor:
-        """Return a correction, without gradient if `wanted` is auto and the distortion ramp has not ended yet."""
+        """Return `correction`, detached if its option `wanted` is auto and the distortion ramp has not ended yet."""
         return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
@@ -320,10 +316,8 @@ class ThermoxelsModel(Model):
         return terms | outputs["known_rays"]
 
     def _known_rays(self) -> dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]]:
-        """Return random rays whose ends are known from photographs, and their loss as a function of the rendering.
-
-        Both stand by the loss's name: tracks, backdrop, bend.
-        """
+        """Return, by name of the loss term (tracks_loss, backdrop_loss, bend_loss), random rays whose ends are known
+        from photographs, and the weighted loss as a function of their rendering."""
         weights, near, voxel = self.loss_weights, self.config.near_plane * self.unit, self.grid.lattice.voxel_size
         known: dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]] = {}
         for name, weight, sampler in (
@@ -345,7 +339,7 @@ class ThermoxelsModel(Model):
         return known
 
     def _feature_ray_loss(self, weight: float, rays: losses.FeatureRaySampler, seen: SceneRender) -> Tensor:
-        """Return the weighted `losses.feature_ray_loss` of rays; a coarse lattice may let light pass points."""
+        """Return `weight` times `losses.feature_ray_loss`; at coarse lattices `coarse_light` may pass the points."""
         lost, left = seen.box.accumulation, seen.box.transmittance
         if seen.around is not None:
             left = left * seen.around.transmittance
@@ -372,7 +366,7 @@ class ThermoxelsModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return metrics of one held-out frame, and pictures with the measured image left of the rendered one.
+        """Return metrics of one held-out frame, and pictures by name; the measured image is left of the rendered one.
 
         The thermal image is rendered from the pose of its own camera if there is one. ``psnr_box`` and
         ``thermal_mae_box_c`` count the pixels whose rays meet the box ahead of the camera; some of these pixels show
@@ -410,11 +404,9 @@ class ThermoxelsModel(Model):
         self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
     ) -> dict[str, float]:
         """Return ``psnr_fitted``: the PSNR of a held-out frame with fitted gains and, if there is one, fitted pose.
-
-        Gains are fitted to all valid pixels. Where the batch has a camera fitted to the frame's own features, the frame
-        is rendered from there, and ``thermal_mae_debiased_c`` is returned too. `outputs` and `seen` are the photograph
-        and the thermal image as rendered from the given poses.
-        """
+        Gains are fitted to all pixels in the mask. If the batch has a camera fitted to the frame's own features, the
+        frame is rendered from there, and ``thermal_mae_debiased_c`` is returned too. `outputs` and `seen` are the
+        photograph and the thermal image as rendered from the given poses; `valid` are the measured thermal pixels."""
         metrics: dict[str, float] = {}
         if batch.get("fitted_camera") is not None:
             outputs = self._rendered(batch["fitted_camera"], RGB_STREAM | THERMAL_STREAM)
@@ -436,20 +428,20 @@ class ThermoxelsModel(Model):
         return metrics
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Return the outputs of a camera's image, in a viewer also ``degrees``, see `DegreesView.picture`."""
+        """Return the outputs of a camera's image; in a viewer, ``degrees`` too, from `DegreesView.picture`."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
         if self.degrees_view is not None and self.degrees_view.shown:
             outputs["degrees"] = self.degrees_view.picture(outputs["temperature_c"])
         return outputs
 
     def _read_ray(self, origin: Tensor, direction: Tensor) -> tuple[float, float]:
-        """Return the temperature, [degrees Celsius], that a ray ends on and its opacity; both arguments are (1, 3)."""
+        """Return the temperature that a ray sees, [degrees Celsius], and its opacity; both arguments are (1, 3)."""
         direction = torch.nn.functional.normalize(direction.to(self.device, torch.float32), dim=-1)
         seen = self._image_outputs(self._request(origin.to(self.device, torch.float32), direction))
         return float(seen["temperature_c"]), float(seen["accumulation"])
 
     def _rendered(self, camera: Cameras, stream: int) -> dict[str, Tensor]:
-        """Return the outputs of `get_outputs` for the image of a camera, shape (1,), in a stream."""
+        """Return the outputs of `get_outputs` for the image of a camera of shape (1,); `stream` are the rays' bits."""
         rays = camera.to(self.device).generate_rays(camera_indices=0, keep_shape=True)
         rays.metadata["stream"] = torch.full((*rays.shape, 1), stream, dtype=torch.uint8, device=self.device)
         return self.get_outputs_for_camera_ray_bundle(rays)
@@ -459,8 +451,8 @@ class ThermoxelsModel(Model):
         """Return the trained field for the mesher, with the evidence of training rays of both streams.
 
         Without rays there is no evidence, and temperatures are the stored ones. Colour is the sigmoid of the harmonic
-        of degree 0, which is the mean over directions where colour is the same from all sides, and about that mean
-        elsewhere; corners without a row are grey.
+        of degree 0, about the mean over directions (exactly, if colour is the same from all sides). Corners without a
+        row are grey.
         """
         grid, colour = self.grid, None
         thermal, thermal_weight, evidence = field_evidence(grid, self.sample_rays, rays)
@@ -486,7 +478,8 @@ class ThermoxelsModel(Model):
 def _seen_and_measured(
     outputs: dict[str, Any], batch: dict[str, Any], name: str, target: str
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the rendered and the measured values of the rays of a stream, rgb or thermal; None without such rays."""
+    """Return rendered and measured values of the rays of the stream `name`, rgb or thermal; None without such rays.
+    `target` is the key of the measured values in `batch`, which has one row per ray."""
     (chosen,) = outputs[f"{name}_rays"].nonzero(as_tuple=True)
     if outputs.get(name) is None or not len(chosen):
         return None

@@ -28,7 +28,7 @@ STEP_OF_COARSEST = 8  # The coarsest resolution is a multiple of this number of 
 
 
 def _in_steps(voxels: float) -> int:
-    """Return a multiple of `STEP_OF_COARSEST`: rounded up by less than 3/4 of a step, otherwise down; at least one."""
+    """Return `voxels` as a multiple of `STEP_OF_COARSEST`, rounded up by less than 3/4 of it, else down; not 0."""
     return STEP_OF_COARSEST * max(1, math.ceil(voxels / STEP_OF_COARSEST - 0.25))
 
 
@@ -197,11 +197,8 @@ class ThermoxelsModelConfig(ModelConfig):
                 raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
 
     def refinements(self) -> dict[int, int]:
-        """Return for each step of `refine_at` the factor by which the edges of voxels are divided.
-
-        Raises:
-            ThermoxelsError: A resolution is no multiple of the one before, or `refine_at` does not fit.
-        """
+        """Return for each step of `refine_at` the factor by which the edges of voxels are divided. Raises
+        `ThermoxelsError` if a resolution is no multiple of the one before or `refine_at` does not fit."""
         pairs = list(zip(self.resolutions, self.resolutions[1:]))
         increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
         increasing = increasing and min((1, *self.refine_at)) == 1
@@ -215,10 +212,12 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """Return the settings for a scene along whose longest side `voxels` voxels of width `voxel_pixels` fit.
 
-        If `voxels` is at most `MOST_STRETCH` times the last resolution, or if `resolutions`, `refine_at` and `prune_at`
-        are not those of `schedule_for`, one factor, at most `MOST_STRETCH`, scales all resolutions. Else `schedule_for`
-        gives all three, for at most `MOST_VOXELS` times the last resolution and `FINEST`. Numbers are rounded, rather
-        up: too few voxels lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128).
+        If `voxels` is at most `MOST_STRETCH` times the last resolution, or if `resolutions`, `refine_at` or `prune_at`
+        differs from `schedule_for`, all resolutions are scaled by one factor of at most `MOST_STRETCH`. Otherwise
+        `schedule_for` gives all three for `voxels`, at most `MOST_VOXELS` times the last resolution and at most
+        `FINEST` (or the last resolution, if that is more). Numbers are rounded, rather up: too few voxels lose shape
+        (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128). Infinite `voxels`, or a
+        `voxel_pixels` of 0, change nothing.
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
@@ -235,17 +234,17 @@ class ThermoxelsModelConfig(ModelConfig):
         return replace(self, resolutions=found.resolutions, refine_at=found.refine_at, prune_at=found.prune_at)
 
     def first_sh_degree(self) -> int | None:
-        """Return the degree of colour at the start: 0, unless colour depends on the direction from step 0 on."""
+        """Return the degree of colour at the start: 0 (`sh_degree` if `view_dependence_from` is 0); None: no colour."""
         return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree
 
     def row_channels(self, resolution: int) -> int:
-        """Return the most numbers that a corner stores, of all parameters, while the lattice has this `resolution`."""
+        """Return the largest count of numbers that a corner stores while the lattice has this `resolution`."""
         gives_way = dict(zip(self.resolutions, self.refine_at)).get(resolution, math.inf)
         degree = self.sh_degree if gives_way > self.view_dependence_from else self.first_sh_degree()
         return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
 
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
-        """Return by name of the grid's parameters the numbers of columns that each may have in a checkpoint."""
+        """Return, by name of a parameter of the grid, the numbers of columns that a checkpoint may have."""
         columns: dict[str, tuple[int, ...]] = {"density": (1,)}
         columns["temperature"] = (num_coefficients(self.temperature_degree),)
         if self.sh_degree is not None:  # one per channel until colour depends on the direction

@@ -12,11 +12,11 @@ def adam_rows(
     begin: int,
     end: int,
     rows,  # numbers of the rows with a gradient, (n,)
-    gradient,  # their gradients, (n, channels)
-    values,  # the parameter, (all rows, channels)
-    first,  # mean of gradients, (all rows, channels)
-    second,  # mean of squared gradients, (all rows, channels)
-    updates,  # number of updates of each row, (all rows,)
+    gradient,  # gradients of these rows, (n, channels)
+    values,  # the parameter, (all rows, channels), changed in place
+    first,  # running mean of gradients, (all rows, channels), changed in place
+    second,  # running mean of squared gradients, (all rows, channels), changed in place
+    updates,  # number of updates of each row, (all rows,), changed in place
     lr,
     beta1,
     beta2,
@@ -24,7 +24,7 @@ def adam_rows(
     correction1,  # 1 - beta1^t by the number t of updates
     correction2,  # 1 - beta2^t by the number t of updates
 ):
-    """Take one step of Adam on ``values[rows[begin:end]]`` and the state of these rows, in place; see `RowAdam`."""
+    """Take one step of Adam on the rows ``rows[begin:end]`` of a parameter and of its state; see `RowAdam`."""
     last1, last2 = len(correction1) - 1, len(correction2) - 1
     one = values.dtype.type  # constants in the parameter's precision, so that the inner loop has one width
     b1, c1, b2, c2, tiny = one(beta1), one(1.0 - beta1), one(beta2), one(1.0 - beta2), one(eps)

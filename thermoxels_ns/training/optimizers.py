@@ -16,11 +16,11 @@ from thermoxels_ns.field.refine import GridChange
 
 
 class RowOptimizer(torch.optim.Optimizer):
-    """An optimiser that updates only the rows (entries along the first axis) that have a gradient.
+    """Base of optimisers that update only the rows (entries along the first axis) that have a gradient.
 
-    Other rows keep their value and their state. State counts the updates of each row, so that a corner first seen late
-    in a training starts like all others. A gradient is a row-sparse tensor (`torch.sparse_coo`, one sparse dimension)
-    or a dense tensor, whose rows of zeros count as rows without a gradient.
+    Other rows keep their value and their state. The state counts the updates of each row, so that a corner first seen
+    late in a training starts like all others. A gradient is a row-sparse tensor (`torch.sparse_coo`, one sparse
+    dimension) or a dense tensor, in which a row of zeros counts as a row without a gradient.
     """
 
     @torch.no_grad()
@@ -44,11 +44,12 @@ class RowOptimizer(torch.optim.Optimizer):
     def update_rows(
         self, parameter: Tensor, rows: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
     ) -> None:
-        """Update ``parameter[rows]``, (rows, channels) as `gradient`, and `state`; `group` has settings such as lr."""
+        """Update ``parameter[rows]`` and ``state[name][rows]`` in place by `gradient`, (rows, channels). `parameter` is
+        (all rows, channels), `state` is that of `new_state`, and `group` has settings such as lr."""
         raise TypeError(f"{type(self).__name__} does not say how rows are updated")
 
     def follow(self, old: Tensor, new: torch.nn.Parameter, change: GridChange) -> None:
-        """Replace parameter `old` by `new`, whose rows or columns differ, and change the state by `change`."""
+        """Optimise the parameter `new` in place of `old`, and map the state, by rows, with `change`."""
         for group in self.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = self.state.pop(old, None)  # type: ignore[arg-type]
@@ -60,7 +61,7 @@ class RowOptimizer(torch.optim.Optimizer):
 
 
 def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the numbers of the rows with a gradient, ascending (rows,), and their gradients (rows, channels)."""
+    """Return the numbers (rows,), ascending, of the rows with a gradient, and their gradients (rows, channels)."""
     if gradient.is_sparse:
         rows = gradient._indices()[0]
         # Accumulation into `grad` forgets that a tensor is coalesced; checking is quicker than coalescing again.
@@ -80,7 +81,7 @@ class RowAdam(RowOptimizer):
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Return two moments and the number of updates of each row, all 0."""
+        """Return the two moments, of the parameter's shape, and the number of updates of each row; all 0."""
         return {
             "exp_avg": torch.zeros_like(parameter),
             "exp_avg_sq": torch.zeros_like(parameter),
@@ -129,7 +130,7 @@ class RowRMSprop(RowOptimizer):
 
 @cache
 def _corrections(beta: float) -> np.ndarray:
-    """Return a table of 1 - beta^t for t = 0, 1, ... up to where the value is 1, also the value for all later t."""
+    """Return the table of 1 - beta^t for t = 0, 1, ...; its last entry is 1 and is valid for all later t, too."""
     count = 2 if beta == 0 else min(1_000_000, int(np.ceil(np.log(1e-17) / np.log(beta))) + 2)
     table = 1.0 - np.power(beta, np.arange(count, dtype=np.float64))
     table[-1] = 1.0

@@ -1,4 +1,4 @@
-"""The nerfstudio pipeline: checkpoints with clear errors, averages of metrics with gaps, the snapshot for meshes."""
+"""The nerfstudio pipeline: loading of checkpoints, averages of metrics, the snapshot for meshes."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class ThermoxelsPipeline(VanillaPipeline):
         return super().model  # type: ignore[return-value]
 
     compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
-    """Function from pipeline to metrics of the surface, which `config.py` sets; None: there are no such metrics."""
-    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10), by which a checkpoint is compared
+    """Function from a pipeline to metrics of its surface, set by `config.py`; None: there are no such metrics."""
+    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10), which a checkpoint must have too
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.cpu_threads is not None and config.cpu_threads < 1:
@@ -90,11 +90,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         return stock + coarse_to_fine_callbacks(self.model, training_callback_attributes)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load the state of a checkpoint into the model.
-
-        Raises:
-            CheckpointError: The checkpoint belongs to another method, to other settings or to another scene.
-        """
+        """Load a checkpoint's state into the model; raise `CheckpointError` if its method, settings or scene differ."""
         state = {name.removeprefix("module."): value for name, value in loaded_state.items()}
         columns = self.model.config.checkpoint_columns()
         found = {
@@ -141,7 +137,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Return metrics averaged over held-out images and, in ns-eval, those of `compare_with_truth`."""
+        """Return metrics averaged over held-out images and, in ns-eval, the metrics of `compare_with_truth`."""
         averages = super().get_average_eval_image_metrics(*args, **kwargs)
         compare = type(self).compare_with_truth
         if self.test_mode == "test" and compare is not None:  # ns-eval; training has "val"
@@ -149,9 +145,10 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Return metrics averaged over images; images where a metric is NaN are left out of its average.
+        """Return metrics averaged over images; an image for which a metric is NaN does not count in its average.
 
-        ``half_transparent``, the share of rays of opacity between 0.1 and 0.9, is added to the metrics of the model.
+        They are the metrics of the model and ``half_transparent``, the share of rays of opacity between 0.1 and 0.9. A
+        metric that is NaN for all images is left out.
         """
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images
@@ -178,10 +175,10 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def corrections(self) -> dict[str, Any]:
-        """Return the corrections of training photographs: dictionaries by file name, for each kind that there is.
+        """Return the corrections of training photographs: by kind, if there is one, a dictionary by file name.
 
         ``poses``: camera to world in input coordinates; ``gains``: of red, green and blue, with geometric mean 1;
-        ``thermal_offsets_c``: by how much the thermal image reads too warm, [K], with mean 0.
+        ``thermal_offsets_c``: the excess of the thermal image's readings, [K], with mean 0.
         """
         datamanager: Any = self.datamanager
         metadata, model, found = datamanager.train_dataparser_outputs.metadata, self.model, {}
@@ -208,8 +205,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
     """Return the content of a checkpoint, read by `torch.load` with ``weights_only=True``, so that no code can run.
 
-    Raises:
-        CheckpointError: The file is damaged, cannot be read, or contains anything but tensors and plain values.
+    Raises `CheckpointError` if the file cannot be read or contains anything but tensors and plain values.
     """
     try:
         return torch.load(path, **{**options, "weights_only": True})

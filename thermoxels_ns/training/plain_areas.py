@@ -1,4 +1,4 @@
-"""Plain areas of photographs, in which no depth is known, get the flattest surface that photographs allow."""
+"""Loss that keeps the surface flat in plain areas of photographs, in which no depth is known."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ ALIKE = 0.06  # Largest difference of a channel between the middle pixel of thre
 
 
 class PlainAreas:
-    """Areas without texture, in which it draws three pixels in a row or column, equally far apart.
+    """Sampler of threes of pixels, in a row or column and equally far apart, in areas without texture.
 
     All pixels between the three are without texture. The middle pixel shows neither a sure depth nor a backdrop. The
-    outer ones may lie on the rim of the plain area, where depths are known.
+    outer pixels may lie on the rim of the plain area, where depths are known. ``len`` is the number of middle pixels.
 
     Args:
         photographs: Pinhole photographs.
@@ -47,12 +47,12 @@ class PlainAreas:
     def request(
         self, count: int, near: float, generator: torch.Generator, device: torch.device
     ) -> tuple[RayRequest, Float[Tensor, " rays"]]:
-        """Return the rays through at most `count` threes of pixels, and their lengths at depth 1 in the photograph.
+        """Return rays through n <= `count` random threes of pixels, (3 n,), and their lengths to depth 1, (3 n,).
 
-        The outer pixels of one side come first, then all middle ones, then the other side: (3 n,) rays, which want
-        neither colour nor temperature. Distances between pixels are drawn evenly by their logarithms. Threes whose
-        colours differ, or whose outer pixels show the backdrop, are left out. `near` is in world units; the generator
-        is on the CPU.
+        The outer pixels of one side come first, then all middle pixels, then the other side. The rays want neither
+        colour nor temperature. The logarithms of distances between pixels are uniform. Threes whose colours differ by
+        more than `ALIKE`, or whose pixels show the backdrop, are left out. `near` is in world units; `generator` must
+        be on the CPU.
         """
         chosen = torch.randint(len(self._middle), (count,), generator=generator).numpy()
         share = torch.rand(count, generator=generator).numpy()
@@ -69,7 +69,7 @@ class PlainAreas:
 
 
 def _even_around(even: BoolArray) -> IntArray:
-    """Return the largest n, (h, w), for which the pixels up to n - 1 columns left and right of a pixel are all even."""
+    """Return for each pixel the largest n for which all pixels up to n - 1 columns left and right are even, (h, w)."""
     column, last = np.arange(even.shape[1]), even.shape[1] - 1
     left = column - np.maximum.accumulate(np.where(even, -1, column), axis=1)
     right = np.minimum.accumulate(np.where(even, last + 1, column)[:, ::-1], axis=1)[:, ::-1] - column
@@ -79,15 +79,15 @@ def _even_around(even: BoolArray) -> IntArray:
 def bend_loss(
     depth: Float[Tensor, " rays"], opacity: Float[Tensor, " rays"], length: Float[Tensor, " rays"], voxel_size: float
 ) -> Float[Tensor, ""]:
-    """Return how far the surface is from flat on threes of pixels: the mean of sqrt(1 + x^2) - 1, [voxels].
+    """Return the mean over threes of pixels of sqrt(1 + x^2) - 1, where x is how far the surface bends, [voxels].
 
-    On a plane the inverse depth is linear in the image. x is the distance, [voxels], from the surface at the middle
-    pixel to where the line between the outer ones meets its ray. Threes with a ray of opacity below one half count 0.
+    x is the distance along the middle ray between the surface and the straight line through the surface at the outer
+    pixels; on a plane, inverse depth is linear in the image. Threes with a ray of opacity below one half count 0.
 
     Args:
         depth: Distance along each ray to the surface, [world units], in the order of `PlainAreas.request`.
         opacity: Opacity of each ray.
-        length: Distance along each ray to depth 1 in the photograph.
+        length: Length of each ray to depth 1, second result of `PlainAreas.request`.
         voxel_size: Edge of a voxel, [world units].
     """
     solid = (opacity.detach().view(3, -1) > 0.5).all(dim=0)

@@ -1,4 +1,4 @@
-"""Statistics of training rays: how much of their weight falls into each voxel, and what they measure at corners."""
+"""Statistics of training rays: their weights in voxels, and the temperatures that they measure at corners."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
 
 Sampler = Callable[[Tensor, Tensor], GridSamples]
-"""A function from origins and directions of rays, (n, 3) each, to their samples in kept voxels of a grid."""
+"""A function from origins and directions of rays, (n, 3) each, to the rays' samples in kept voxels of a grid."""
 
 
 def _sampled(
@@ -34,9 +34,9 @@ def _sampled(
 def voxel_weights(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
 ) -> tuple[Float[Tensor, " voxels"], Bool[Tensor, " voxels"]]:
-    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel.
+    """Return for each kept voxel the largest weight of a sample in it, and whether some ray ends in it.
 
-    A ray that ends on something (opacity above one half) ends where half of its weight is complete.
+    Only a ray of opacity above one half ends: at the sample that completes half of its weight.
     """
     device = grid.density.device
     largest = torch.zeros(len(grid.voxels), device=device)
@@ -48,7 +48,7 @@ def voxel_weights(
 
 
 def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
-    """Return, for each ray of opacity above one half, the index of the sample that completes half of its weight."""
+    """Return the index of the sample that completes half of a ray's weight, for each ray of opacity above one half."""
     opacity = (1.0 - samples.transmittance)[samples.ray]
     spent = (opacity > 0.5) & (samples.before + samples.weight >= 0.5 * opacity)
     (places,) = spent.nonzero(as_tuple=True)
@@ -62,7 +62,7 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 def share_of_rays_opened(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]
 ) -> float:
-    """Of the rays with opacity above one half, return the share that pruning to `keep` would open.
+    """Return the share of rays that pruning to the voxels True in `keep` would open, of rays of opacity above 1/2.
 
     A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
     """
@@ -78,9 +78,9 @@ def share_of_rays_opened(
 
 
 END_WIDTH = 0.5
-"""Distance, [voxels], before and behind the sample that completes half of a ray's weight, within which the voxels that
-the ray crosses count as met. If a sharp surface lies behind the centre of a voxel, that voxel is empty at its centre
-although rays end in it; the solid begins with the next voxel, whose centre is at most half a voxel farther in."""
+"""Distance, [voxels], from the sample that completes half of a ray's weight, forwards and backwards, within which the
+ray meets the voxels that it crosses. If a sharp surface lies behind the centre of a voxel, the voxel is empty at its
+centre although rays end in it; the solid begins with the next voxel, whose centre is at most half a voxel farther."""
 _END_STEPS = 5
 
 
@@ -88,16 +88,14 @@ _END_STEPS = 5
 def field_evidence(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
 ) -> tuple[Float[Tensor, " rows"], Float[Tensor, " rows"], RayEvidence | None]:
-    """Return what training rays say about the trained field, found in one pass.
+    """Return the temperature and the observed weight of each row, and the evidence of where training rays end.
 
-    These are the normalised temperature around each corner of a kept voxel, clipped to [0, 1], which is the stored one
-    where no thermal ray came; the sum of the weights of first-hit samples around each corner, shared out by trilinear
-    weights, [rays]; and where rays end, in their order (None: there are no rays).
-
-    The temperature of a corner is a mean over samples of thermal rays, weighted by their share of the pixel; stored
-    values of single corners can overshoot where images are right, but this mean cannot. Only first hits count: samples
-    of rays of opacity above one half, before half of the light is spent, so that light which leaks through a surface
-    measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal.
+    The temperature, normalised and clipped to [0, 1], is the mean of the field over first-hit samples of thermal rays
+    around the row's corner, by weight and trilinear weight; without such a sample, it is the stored temperature. Stored
+    values of single corners can overshoot although images are right, but this mean cannot. The observed weight, [rays],
+    is the sum of these weights. First-hit samples are the samples, of rays of opacity above one half, before half of
+    the light is spent: light that leaks through a surface measures nothing behind it. A ray without a stream (see
+    `core.feature_rays`) counts as thermal. The evidence is None if there are no rays.
     """
     device = grid.density.device
     centre_density = grid.voxel_density()
@@ -142,10 +140,8 @@ def _density_met(
     fraction: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, " n"]:
-    """Return the highest density at the centres of voxels that a direction meets in `END_WIDTH` around each point.
-
-    A point lies in the voxel of this index, at this fraction of the voxel along each axis.
-    """
+    """Return for each point the highest density at centres of voxels met within `END_WIDTH` along its direction. A
+    point lies in the voxel of index `voxel`, at `fraction` of this voxel along each axis."""
     shape = torch.tensor(centre_density.shape, device=centre_density.device)
     met = torch.zeros(len(voxel), dtype=centre_density.dtype, device=centre_density.device)
     for offset in torch.linspace(-END_WIDTH, END_WIDTH, _END_STEPS).tolist():
@@ -160,7 +156,7 @@ def _density_met(
 def backdrop_evidence(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
 ) -> tuple[float, Float[Tensor, "n 3"]]:
-    """Return the share and the directions (n, 3) of the rays that leave the box with more than half of their light."""
+    """Return the share, of all rays, and the directions of rays that leave the box with over half of their light."""
     seen, open_directions = 0, [torch.zeros(0, 3, device=grid.density.device)]
     for _, directions, samples in _sampled(grid, sample, rays):
         open_directions.append(directions[samples.transmittance > 0.5])

@@ -15,8 +15,8 @@ _REFINE: Mapping[int, tuple[float, ...]] = {
     1: (0.25,),
     2: (0.2, 0.5),
 }
-"""Steps of up to two refinements. With three, 320 voxels begin as 40, which hold no body that fills a third of the box:
-of what cameras see of wild-14, F is 0.82, and 0.86 with two."""
+"""By number of refinements, the share of the run at which each happens. With three refinements 320 voxels begin as 40,
+too few for a body that fills a third of the box: of what cameras see of wild-14, F is 0.82, and 0.86 with two."""
 _PRUNE_AFTER = 0.13  # Share of the run between a refinement and the pruning that drops what it left empty
 _THIN = 0.8
 _VIEW_DEPENDENCE = 0.8
@@ -48,15 +48,10 @@ class Schedule:
 
 
 def schedule_for(resolution: int, steps: int, voxel_pixels: float = 0.0) -> Schedule:
-    """Return the schedule of a training that ends with a resolution after a number of steps.
+    """Return the schedule of a training of `steps` steps that ends with `resolution` voxels along the longest side.
 
-    Args:
-        resolution: Voxels along the longest side of the scene box at the end, at least 1.
-        steps: Training steps, at least 10.
-        voxel_pixels: Width of the last voxels, [pixels], by which a scene adapts the resolutions; 0: it does not.
-
-    Raises:
-        ThermoxelsError: `resolution` is below 1, or `steps` below 10.
+    `voxel_pixels` is the width of the last voxels, [pixels], by which a scene adapts the resolutions; 0: it does not.
+    Raises `ThermoxelsError` if `resolution` is below 1 or `steps` below 10.
 
     >>> schedule_for(128, 1000).refine_at
     (200, 500)

@@ -79,7 +79,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         super().set_experiment_name()
 
     def moved_to(self, folder: Path) -> None:
-        """Use `folder` as the run's folder, and the scene at the same place relative to it as when it was trained."""
+        """Use `folder` as the run's folder, and the scene at its old place relative to this folder if it is there."""
         manager: Any = self.pipeline.datamanager
         scene = scene_of_run(folder, manager.data or manager.dataparser.data, self.scene_from_run)
         manager.dataparser.data = scene
@@ -87,11 +87,8 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.__dict__["_folder"] = folder  # no field: it is not written to config.yml
 
     def get_base_dir(self) -> Path:
-        """Return the folder of the run: that of `moved_to`, or else one that always lies inside `output_dir`.
-
-        Raises:
-            OutputError: The name of a folder in the path contains a separator, or is ``.`` or ``..``.
-        """
+        """Return the folder of the run: the argument of `moved_to`, if it was called, else a folder in `output_dir`.
+        Raises `OutputError` if the name of a folder in the path contains a separator, or is ``.`` or ``..``."""
         if "_folder" in vars(self):
             return vars(self)["_folder"]
         self.set_experiment_name()
@@ -111,11 +108,8 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             super().print_to_terminal()
 
     def save_config(self) -> None:
-        """Check all options, lock the run's folder while this process lives, and write config.yml.
-
-        Raises:
-            ThermoxelsError: An option is out of range, the folder cannot be written to, or another training uses it.
-        """
+        """Check all options, lock the run's folder while this process lives, and write config.yml. Raises
+        `ThermoxelsError` if an option is out of range, or if the folder is not writable or already in use."""
         self.follow_checkpoint()
         model: Any = self.pipeline.model
         if typed("--pipeline.model.resolutions") and not typed("--pipeline.model.voxel-pixels"):
@@ -159,7 +153,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             raise ThermoxelsError("device_type", expected=expected, got=self.machine.device_type, remedy=remedy)
 
     def follow_checkpoint(self) -> None:
-        """Unless a quality is given, take resolutions and schedules that were not typed from the resumed run."""
+        """Take resolutions and schedules from the run that is resumed, unless they were typed or a quality is given."""
         folder = self.load_dir or (self.load_checkpoint.parent if self.load_checkpoint else None)
         if self.quality is not None or folder is None or not (folder.parent / "config.yml").is_file():
             return
@@ -175,7 +169,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
                 group["scheduler"] = before
 
     def follow_schedule(self, schedule: Schedule) -> None:
-        """Set the number of steps, the lengths of learning rate schedules, and the model's options to a schedule."""
+        """Set the number of steps, the lengths of learning rate schedules, and the model's options by `schedule`."""
         self.max_num_iterations = schedule.steps
         for group in self.optimizers.values():
             if group.get("scheduler") is not None:
@@ -186,16 +180,13 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
 
 class ThermoxelsTrainer(Trainer):
-    """Trainer of the voxel model whose checkpoints are complete or absent."""
+    """Trainer of the voxel model; it writes a checkpoint completely or not at all."""
 
     config: ThermoxelsTrainerConfig
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Build the pipeline, load the checkpoint if one is named, and log which options a quality replaced.
-
-        Raises:
-            CheckpointError: The named checkpoint does not exist, or the training cannot go on from it.
-        """
+        """Build the pipeline, load the checkpoint if one is named, and log which options a quality replaced. Raises
+        `CheckpointError` if the named checkpoint does not exist or the training cannot go on from it."""
         quality, replaced = self.config.quality, self.config.replaced
         if quality is not None:
             said = "about {} voxels and {} steps".format(*QUALITIES[quality])
@@ -219,7 +210,7 @@ class ThermoxelsTrainer(Trainer):
             path.write_text(yaml.dump(kept), encoding="utf-8")
 
     def train(self) -> None:
-        """Run the training and say what may follow; raise `OutputError` if results cannot be written."""
+        """Run the training and print the next command; raise `OutputError` if results cannot be written."""
         with plain_os_errors(self.base_dir):
             super().train()
         if self.local_rank == 0:
@@ -231,7 +222,7 @@ class ThermoxelsTrainer(Trainer):
         """Say nothing: nerfstudio's note is about evaluations while training, which are off by default."""
 
     def _load_checkpoint(self) -> None:
-        """Load the named checkpoint, if any, and log to which step training goes on; may raise `CheckpointError`."""
+        """Load the named checkpoint, if any, and log the steps to come; raise `CheckpointError` if it does not fit."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
         missing = None if folder is not None or file is None or file.is_file() else f"no file {file}"
         if folder is not None:
