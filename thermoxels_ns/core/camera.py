@@ -125,8 +125,7 @@ class Camera:
         return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
 
     def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> BoolArray:
-        """Return whether each of the pixels (n, 2) lies in the image, `border` or more pixels from its edge; (n,). NaN
-        lies outside."""
+        """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge, (n,); NaN: False."""
         x, y = np.asarray(pixels, dtype=np.float64).T
         return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
 

@@ -59,10 +59,8 @@ def check_array(
     remedy: str,
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> npt.NDArray:
-    """Return `array` if every entry is finite and its shape matches `shape`, else raise `error`.
-
-    A length None in `shape` matches any length. If `shape` is None, the array may have any shape.
-    """
+    """Return `array` if every entry is finite and its shape matches `shape`, else raise `error`. A length None in
+    `shape` matches any length. If `shape` is None, the array may have any shape."""
     if shape is not None and (
         len(array.shape) != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape))
     ):
@@ -109,10 +107,8 @@ def plain_os_errors(
 
 
 def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
-    """Make the folder `path` if needed and return it.
-
-    Raises `OutputError` if no temporary file can be made in the folder, or if fewer than `room_bytes` are free there.
-    """
+    """Make the folder `path` if needed and return it. Raises `OutputError` if no temporary file can be made in the
+    folder, or if fewer than `room_bytes` are free there."""
     folder, remedy = Path(path), "Choose another folder or change its permissions."
     expected = f"a folder that can be written to at {folder}"
     with plain_os_errors("output folder", expected, remedy, always_what=True):
@@ -203,11 +199,11 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
     """Make the folder of a command's results, if needed, and return it.
 
-    Raises `OutputError` if a folder has the name of a result, or if results are there but `first` is not.
+    Raises `OutputError` if a folder is in the place of a file or the reverse, or if results exist without `first`.
 
     Args:
         files: Names of all files in the folder `path` that the command may write.
-        first: Name of the file that a run writes first. If it is missing, someone else wrote the other files.
+        first: Name of the file that a run writes first. If it is missing, the other files are not the command's.
         series: Pattern of result files in a subfolder, such as ``heat/step-*.vtu``; None: there are none.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]

@@ -64,7 +64,7 @@ class ConfigLoader(yaml.Loader):
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Loader that imports nothing: it makes objects mappings of fields, paths lists of parts, and names None."""
+    """Loader that imports nothing: objects become mappings of fields, paths become lists of parts, names are None."""
 
 
 def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
@@ -159,7 +159,7 @@ def typed_value(option: str) -> str | None:
 
 
 class ModuleWith(ModuleType):
-    """A stand-in for `module`: a name in `replaced` has the value given there, any other its value in `module`."""
+    """A stand-in for `module`: names in `replaced` have the values given there, other names the module's values."""
 
     def __init__(self, module: ModuleType, **replaced: Any) -> None:
         super().__init__(module.__name__, doc=module.__doc__)

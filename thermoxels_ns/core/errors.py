@@ -68,7 +68,7 @@ def exit_status(problem: BaseException) -> int:
 
 
 def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
-    """Return the message of an error made of its four parts.
+    """Return the message of an error, made of its four parts.
 
     >>> explain("metres_per_unit", expected="a number above 0", got=-1, remedy="Pass --metres-per-unit 1.")
     'metres_per_unit: expected a number above 0, got -1. Pass --metres-per-unit 1.'

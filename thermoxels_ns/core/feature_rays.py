@@ -13,8 +13,8 @@ RGB_STREAM = 1  # The ray carries a colour target
 THERMAL_STREAM = 2  # The ray carries a temperature target
 
 MARGIN_VOXELS, MARGIN_ERRORS = 1.5, 2.0
-"""Margin around the point of a feature ray: so many voxels plus so many standard errors of the ray's length. Within it
-the air may end and the surface may lie: in the loss of feature rays, in votes on air, in the support of surfaces."""
+"""Margin around the point of a feature ray: so many voxels plus so many standard errors of the ray's length. Air
+reaches to the margin, and the surface lies within it: for the loss, for votes on air, for the support of surfaces."""
 NEIGHBOURS = 8  # Number of nearest points in a photograph with which the distance of a point is compared
 FEWEST_NEIGHBOURS = 4  # A photograph with fewer neighbours of a point cannot contradict the point
 STEEPEST = 3.0  # Largest slope of a surface against the photograph at which points on it agree: 72 degrees
@@ -25,7 +25,7 @@ _RAYS_AT_ONCE = 1 << 18  # Rays whose neighbours are sought at once, to limit me
 
 @dataclass(frozen=True, eq=False)
 class FeatureRays:
-    """Rays from camera centres to points on which photographs agree, [world units]; there is only air between them."""
+    """Rays from camera centres to points on which photographs agree, [world units]; rays pass through air only."""
 
     origins: FloatArray  # Camera centre of each ray, shape (s, 3)
     point: IntArray  # Index into `points` of each ray, ascending, shape (s,)
@@ -51,12 +51,12 @@ class FeatureRays:
 def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
     """Return for each point, (n,), whether it is about as far from the cameras as its neighbours in photographs are.
 
-    Wrong matches rarely are. All rays of one origin form a photograph. The neighbours of a point in a photograph are
-    the `NEIGHBOURS` points whose directions are nearest. A neighbour agrees if its distance differs by at most the
-    largest of: `STEEPEST` times its distance across the ray, the share `LEAST_TOLERANCE` of the point's distance,
-    `TOLERANCE_ERRORS` standard errors. A photograph vouches for the point if at least half of the neighbours agree, or
-    if there are fewer than `FEWEST_NEIGHBOURS`. The result is True if at least half of the photographs vouch for the
-    point, or if it has no rays. It may be False for a right point on a thin thing in front of other things.
+    For wrong matches this is rarely so. All rays of one origin form a photograph. The neighbours of a point in a
+    photograph are the `NEIGHBOURS` points whose directions are nearest. A neighbour agrees if its distance differs by
+    at most the largest of: `STEEPEST` times its distance across the ray, the share `LEAST_TOLERANCE` of the point's
+    distance, `TOLERANCE_ERRORS` standard errors. A photograph vouches for the point if at least half of the neighbours
+    agree, or if there are fewer than `FEWEST_NEIGHBOURS`. The result is True if at least half of the photographs vouch
+    for the point, or if the point has no rays. A right point on a thin thing in front of other things may be False.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 

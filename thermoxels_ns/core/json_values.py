@@ -56,10 +56,8 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Return the content of a json file; raises `error` if the file is missing or damaged or repeats a key.
-
-    `expected` and `remedy` are parts of the message about a missing or damaged file.
-    """
+    """Return the content of a json file; raises `error` if the file is missing or damaged or repeats a key. `expected`
+    and `remedy` are parts of the message about a missing or damaged file."""
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:

@@ -44,10 +44,8 @@ def _forget_once(room: str, cached: Path) -> None:
 
 
 def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:
-    """Remove the compiled kernels in the folder `cached` if any of `sources` has changed since the last call.
-
-    Return True if they were removed; False if no source has changed, or if the folder cannot be written.
-    """
+    """Remove the compiled kernels in the folder `cached` if any of `sources` has changed since the last call. Return
+    True if they were removed; False if no source has changed, or if the folder cannot be written."""
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()
     mark = cached / _DIGEST
     with suppress(OSError):

@@ -23,7 +23,7 @@ class Lattice:
     """A regular lattice of cubic voxels with values on their corners.
 
     Corner (i, j, k) is at ``lo + (i, j, k) * voxel_size``; N corners along an axis span N - 1 voxels. The flat index of
-    a corner is ``(i * ny + j) * nz + k`` (C order). The flat index of a cell (a voxel) is the same with `cell_shape`.
+    a corner is ``(i * ny + j) * nz + k`` (C order). For a cell (a voxel), `cell_shape` takes the place of `shape`.
     """
 
     lo: tuple[float, float, float]  # World position of corner (0, 0, 0)
@@ -38,7 +38,7 @@ class Lattice:
     def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:
         """Return the lattice that covers a box with `resolution` voxels along its longest side.
 
-        A shorter side gets the fewest voxels that cover it, which exceed the box by the same length at both ends.
+        A shorter side gets the fewest voxels that cover it; they exceed the box by the same length at both ends.
         Raises `ThermoxelsError` unless all sides are finite and above 0 and `resolution` is at least 1.
 
         >>> Lattice.covering((0, 0, 0), (2, 1, 0.9), 4)

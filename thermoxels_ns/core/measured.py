@@ -64,7 +64,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Unit:
-    """The unit of a field of a record and the limits of its value: ``Annotated[Measured, Unit("1", 0.0, 1.0)]``."""
+    """Unit of a field of a record, and limits of its value: annotate ``Annotated[Measured, Unit("1", 0.0, 1.0)]``."""
 
     name: str  # Key of the table of units, such as "m/s"; "1": no unit
     low: float = -math.inf  # Least value allowed
@@ -74,7 +74,7 @@ class Unit:
 
     def read(self, content: object) -> Measured:
         """Return `content` as a `Measured` in this unit; raise ValueError if it is unreadable or out of the limits.
-        `content` is a `Measured` in this unit, a dictionary of its two fields, or an argument of `read_measured`."""
+        `content` is a `Measured` in this unit, a dictionary of its two fields, or what `read_measured` reads."""
         try:
             if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
                 value, off_by = content["value"], content["off_by"]

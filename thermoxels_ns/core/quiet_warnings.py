@@ -17,7 +17,7 @@ PROGRAMMERS_WARNINGS: tuple[tuple[str, type[Warning]], ...] = (
 
 
 def silence() -> None:
-    """Show none of `PROGRAMMERS_WARNINGS` in this process; a user who set warning filters keeps those."""
+    """Show none of `PROGRAMMERS_WARNINGS` in this process, unless the user has set warning filters for Python."""
     if not sys.warnoptions:
         for begin, kind in PROGRAMMERS_WARNINGS:
             warnings.filterwarnings("ignore", re.escape(begin), kind)

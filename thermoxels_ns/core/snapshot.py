@@ -45,7 +45,7 @@ class Views:
         return local
 
     def shows(self, camera: int, directions: FloatArray) -> BoolArray:
-        """Return for each direction (..., 3) from the centre of a camera whether it lies in the image, shape (...)."""
+        """Return for each direction (..., 3) from the centre of `camera` whether its image shows it, shape (...)."""
         local = directions @ self.camera_to_world[camera, :, :3]
         depth = -local[..., 2]
         ahead = depth > 1e-9
@@ -95,7 +95,7 @@ class RayEvidence:
 
 @dataclass(frozen=True)
 class GridSnapshot:
-    """The trained field as arrays on the corners of a lattice. Shapes and finite values are checked (`MeshError`)."""
+    """The trained field as arrays on the corners of a lattice. Raises `MeshError` for wrong shapes and bad values."""
 
     lattice: Lattice
     density: Float32Array  # Density after activation at the corners, [1 / world unit], >= 0

@@ -1,4 +1,4 @@
-"""Results as tables: lists of rows, each a dictionary from column name to plain value, or pandas frames."""
+"""Results as tables: lists of rows, each row a dictionary from column name to plain value; also as pandas frames."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class TemperatureRange:
 
     @classmethod
     def spanning(cls, min_c: float, max_c: float) -> TemperatureRange:
-        """Return the range between the data's extremes; if these nearly coincide, a range of 1 K around them.
+        """Return the range from `min_c` to `max_c`; if these are less than 0.001 K apart, the 1 K around them.
 
         >>> TemperatureRange.spanning(20.0, 20.0)
         TemperatureRange(min_c=19.5, max_c=20.5)

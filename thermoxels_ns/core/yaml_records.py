@@ -61,7 +61,7 @@ def write_example(path: Path, example: str, error: type[ThermoxelsError]) -> Non
 
 @contextmanager
 def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
-    """Replace a `ThermoxelsError` of a with block or decorated function by an `error` with the text `before` + text."""
+    """Replace a `ThermoxelsError` of a with block or decorated function by `error`, with `before` before the text."""
     try:
         yield
     except ThermoxelsError as problem:
@@ -239,10 +239,8 @@ Config = TypeVar("Config")
 
 
 def with_overrides(config: Config, overrides: Mapping[str, Any]) -> Config:
-    """Return a copy of a (nested) dataclass, or a mapping of dataclasses, with the fields in `overrides` replaced.
-
-    A list in place of a tuple becomes a tuple. Raises `KeyError` for a name that `config` does not have.
-    """
+    """Return a copy of a (nested) dataclass, or a mapping of dataclasses, with the fields in `overrides` replaced. A
+    list in place of a tuple becomes a tuple. Raises `KeyError` for a name that `config` does not have."""
     fields, changed = dict(config) if isinstance(config, Mapping) else vars(config), {}
     for key, value in overrides.items():
         old = fields[key]

@@ -61,9 +61,7 @@ def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Fl
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
     """Return for each row the sum over points of `values` times the trilinear weight of the row's corner at the point.
-
-    This is the transpose of `interpolate`. All points must lie in kept voxels.
-    """
+    This is the transpose of `interpolate`. All points must lie in kept voxels."""
     total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total

@@ -132,9 +132,7 @@ class MemoryNeed:
 
 def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
     """Return the predicted memory for training on `voxels` kept voxels of a lattice with `channels` numbers per corner.
-
-    Each channel of a corner takes a value, two moments of the optimiser and a gradient, each of four bytes.
-    """
+    Each channel of a corner takes a value, two moments of the optimiser and a gradient, each of four bytes."""
     total = int(np.prod([float(n) for n in lattice.cell_shape]))
     rows = lattice.num_corners if voxels >= total else min(lattice.num_corners, int(_ROWS_PER_VOXEL * voxels))
     bytes_per_row = 4 * channels * (1 + 2 + 1) + 4 + 8

@@ -54,10 +54,8 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
 
 @torch.no_grad()
 def refine(grid: VoxelGrid, factor: int = 2) -> GridChange:
-    """Split every kept voxel of `grid` into factor^3, in place; return the interpolation from old rows to new rows.
-
-    The field does not change: new corners get interpolated raw values, and old corners keep their exact values.
-    """
+    """Split every kept voxel of `grid` into factor^3, in place; return the interpolation from old rows to new rows. The
+    field does not change: new corners get interpolated raw values, and old corners keep their exact values."""
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
 
@@ -75,7 +73,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> GridChange:
 
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: BoolArray) -> GridChange:
-    """Drop the voxels of `grid` that are False in `keep` (voxels,), in place; return the selection of the rows left."""
+    """Drop the voxels that are False in `keep` (voxels,) from `grid`, in place; return the `GridChange` of its rows."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: IntArray = np.searchsorted(voxels.corners, new.corners)

@@ -40,7 +40,7 @@ class Surroundings(nn.Module):
         box: Lower and upper corner, [world units].
         across: Width of a face at the start, [voxels].
         deep: Number of voxels from a face to infinity at the start.
-        start_density: Density at the start, as all densities per edge of a voxel at the start; see `VoxelGrid`.
+        start_density: Density at the start, [1 / edge of a voxel at the start], the unit of all densities here.
         activation: See `VoxelGrid`.
         colour: False: no colour is stored.
     """

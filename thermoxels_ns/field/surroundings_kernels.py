@@ -68,7 +68,8 @@ def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
 
 @kernel
 def _begin(at, along):
-    """Return the distance, at least 0, at which a ray leaves the box -1 to 1; if it misses, that nearest to 0, 0, 0."""
+    """Return the distance, at least 0, at which a ray leaves the box -1 to 1. For a ray that misses the box, return the
+    distance of its point nearest to the middle."""
     enter, leave, across, square = -np.inf, np.inf, 0.0, 0.0
     for i in range(3):
         step = along[i] if abs(along[i]) > 1e-12 else 1e-12

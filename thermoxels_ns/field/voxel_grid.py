@@ -94,7 +94,7 @@ class VoxelGrid(nn.Module):
 
     @property
     def lattice(self) -> Lattice:
-        """The whole lattice, with corners that no kept voxel uses."""
+        """The whole lattice, including corners that no kept voxel uses."""
         return self.voxels.lattice
 
     @property

@@ -12,7 +12,7 @@ from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 
 PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels beside it
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which no side of a photograph is its top
-LEVEL = 10.0  # Weight, in `upwards`, of one image axis being level against that of the other being steep
+LEVEL = 10.0  # Weight, in `upwards`, of how level one image axis is, relative to how steep the other is
 TOLERANCE = 0.1
 """Largest difference of a pixel's channels from the backdrop's colour, of 1, and temperature, of the scene's range. On
 eight drawn scenes and a real street, 0.06 for colours finds less of the sky (saharov32: 54 % instead of 69 %); neither
@@ -80,10 +80,11 @@ def what_is_above(
 ) -> Literal["sky", "ceiling", "unknown"]:
     """Return whether the pixels that are True in `plain` (pixels,) show a sky or the ceiling of a room.
 
-    If no surfaces of known `depth` (pixels,), NaN if unknown, rise behind the cameras (`SURROUNDED`), they show a sky.
-    In a room surfaces do, as other photographs show, but also in a yard or a street. There a sky is known by its
-    temperature, which is below that of nearly all surfaces (`COLDER`) or below all that the camera measures. Without
-    temperatures the result is "unknown": a ceiling looks like a cloudy sky. `up` is a unit vector, (3,).
+    The result is "sky" if known surfaces hardly rise behind the cameras (`SURROUNDED`). In a room they do, as other
+    photographs show, but also in a yard or a street. If they do, the result is "sky" if the median plain pixel is
+    colder than nearly all surfaces (`COLDER`) or below all that the camera measures, otherwise "ceiling". Without
+    temperatures of surfaces it is "unknown": a ceiling looks like a cloudy sky. `depth` (pixels,) is NaN if unknown;
+    `up` is a unit vector, (3,).
     """
     (known,) = np.nonzero(np.isfinite(depth))
     some = known[:: max(1, len(known) // _SOME)]
@@ -151,10 +152,12 @@ def _alike(
     chosen: BoolArray,
     measured: Float32Array | None = None,
 ) -> BoolArray:
-    """Return which pixels look like most of the `chosen` ones, by colour and, if known, temperature, (pixels,). The
-    expected look is fitted as a function of `directions` (pixels, 3). `values` (pixels, 4) are red, green, blue and
+    """Return which pixels look like most of the `chosen` ones, by colour and, if known, temperature, (pixels,).
+
+    The expected look is fitted as a function of `directions` (pixels, 3). `values` (pixels, 4) are red, green, blue and
     temperature. `measured` (pixels, 3) are colours before correction; None: there was none. Any colour between measured
-    and corrected one may match; for a saturated pixel, so may any brighter colour."""
+    and corrected one may match; for a saturated pixel, so may any brighter colour.
+    """
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
     some = np.flatnonzero(chosen)

@@ -130,10 +130,10 @@ def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: 
 
 
 def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int = 0) -> AdjustedPoses | None:
-    """Return poses adjusted to tracks by bundle adjustment, or None if the adjustment does not prove itself.
+    """Return poses adjusted to tracks by bundle adjustment, or None if tracks held back do not fit better then.
 
-    It proves itself if tracks held back from a trial adjustment then fit better (`WORTH_IT`). If `fixed` is 0, the
-    adjusted poses as a whole keep the place, orientation and scale of the given poses.
+    The tracks held back, every third one, judge a trial adjustment to the others (`WORTH_IT`); the poses returned are
+    adjusted to all. If `fixed` is 0, they keep the place, orientation and scale of the given poses as a whole.
 
     Args:
         tracks: Tracks of all photographs.
@@ -236,9 +236,11 @@ def _plausible(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> Tracks:
 
 def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) -> FloatArray | None:
     """Return poses (n, 4, 4) that minimise the distances between features and points, or None if a step is not finite.
+
     This is bundle adjustment (Triggs and others 2000) by Gauss-Newton steps on robust squared distances (Geman and
     McClure 1987): corners of roofs and branches, which look different in each photograph, hardly count. Points are
-    eliminated (Schur complement). The errors expected of the given poses, `POSE_ERROR_DEG`, are a prior."""
+    eliminated (Schur complement). The errors expected of the given poses, `POSE_ERROR_DEG`, are a prior.
+    """
     from scipy import sparse
     from scipy.spatial.transform import Rotation
 

@@ -11,7 +11,7 @@ from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import TOLERANCE, Depths
 
 MOST_PIXELS = 1500  # Pixels of each photograph, or up to twice as many, that are looked up in the others
-DARKEST, BRIGHTEST = 0.06, 0.94  # Pixels used for gains have channels between: noise below, saturation above
+DARKEST, BRIGHTEST = 0.06, 0.94  # Channel values between these are used for gains: below is noise, above saturation
 FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
 """Standard deviation, of 1, of the systematic error of a channel's median ratio between two photographs, which noise
@@ -43,11 +43,11 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> tuple[Float
     """Return gains and temperature offsets of the photographs, and their standard errors, both (photographs, 4).
 
     Columns 0 to 2 are the natural logarithms of the gains of red, green and blue; column 3 is the offset of normalised
-    temperature. For two photographs a and b, compared at points at which both have the same depth, the median of
-    ln(a / b) is the difference of their log gains, and the median difference of `thermal` (pixels,), normalised
-    temperature with NaN for unknown, is the difference of their offsets. Each column is the robust, weighted least
-    squares solution for the largest group of photographs that pairs link, with mean 0 over this group. All other
-    photographs have values of 0 and errors of `FREE`.
+    temperature. Two photographs a and b are compared at points at which both have the same depth. The median of
+    ln(a / b) is the difference of their log gains; the median difference of `thermal` is the difference of their
+    offsets. `thermal` (pixels,) is the normalised temperature, NaN if unknown. Robust, weighted least squares over all
+    pairs give the values of each column, relative to their mean. Only the largest group of photographs that pairs link
+    is solved. All other photographs have values of 0 and errors of `FREE`.
     """
     photographs = depths.photographs
     count = len(photographs)
@@ -97,10 +97,12 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> tuple[Float
 
 
 def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return values x of `count` photographs from differences `off` (p,) = x_a - x_b of pairs (a, b), and errors. This
-    is iteratively reweighted least squares (Huber) with `weights` (p,), the inverse variances of `off`. Only the
+    """Return values x of `count` photographs from differences `off` (p,) = x_a - x_b of pairs (a, b), and errors.
+
+    This is iteratively reweighted least squares (Huber) with `weights` (p,), the inverse variances of `off`. Only the
     largest group of photographs that `pairs` (p, 2) of weight above 0 link is solved; its mean is 0. All others have
-    the value 0 and the standard error `FREE`. Both results are (count,)."""
+    the value 0 and the standard error `FREE`. Both results are (count,).
+    """
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
 

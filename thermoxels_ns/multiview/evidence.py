@@ -23,7 +23,7 @@ from thermoxels_ns.multiview.stereo import (
 
 LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure depth; fewer may be chance
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
-TAIL = 0.5  # Points left out at either end of an axis for the hull on which a ceiling lies, [%]
+TAIL = 0.5  # Share of points left out at either end of each axis, for the hull on which a ceiling lies, [%]
 FEWEST_POINTS = 100  # Points in the box that such a hull needs
 CEILING_ERROR = 0.02  # Standard error of a ceiling's depth, of the depth; in a drawn living room 1.8 % in the median
 LEAST_GAIN = 0.01  # Gains are corrected if the root mean square of their logarithms is above this
@@ -45,7 +45,7 @@ class PhotographEvidence:
     offset: FloatArray | None  # Offset of normalised temperature, (photographs,); None: offsets were not corrected
 
     def plain_rays(self, lo: FloatArray, hi: FloatArray) -> FeatureRays | None:
-        """Return one ray per plain pixel: to far behind the box from `lo` to `hi` for a backdrop, else to the ceiling.
+        """Return one ray per plain pixel: to a point far behind the box from `lo` to `hi`, or to a point on a ceiling.
 
         A ceiling is taken to lie on the convex hull of the known points in the box, without the outermost points along
         each axis (`TAIL`). None if fewer than `LEAST_SHARE` of the pixels have a ray, or if a ceiling has fewer than

@@ -37,7 +37,7 @@ class Photographs:
 
     @property
     def numbers(self) -> IntArray:
-        """Index of the photograph that each pixel belongs to, shape (pixels,)."""
+        """Index of the photograph to which each pixel belongs, shape (pixels,)."""
         return np.repeat(np.arange(len(self)), np.prod(self.sizes, axis=1))
 
     def __len__(self) -> int:

@@ -44,7 +44,7 @@ best. On a ramp these may be wrong planes, but sure depths alone gave no better 
 places along a shallow ramp, nor say where an even area ends: with this cost and `PAIRS_IN_LINE`, pixels of the body
 with a depth rise from 37, 55, 35 and 52 % to 61, 66, 49 and 54 % (wild-7, courtyard, white house, saharov32), and the
 wrong ones among them fall to half or less. Costs of 0.1 to 0.6 and limits of 2 to 6 were tried, with margins of 0.03 to
-0.1. If texture is as fine as pixels, differences are noise: a drawn block before random pixels loses 12 % of depths."""
+0.1. If texture is as fine as pixels, differences are noise: a block before far random walls loses 12 % of depths."""
 STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side; a correlation r costs
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
@@ -230,7 +230,7 @@ def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatA
 def _usefully_seen(
     photographs: Photographs, number: int, other: int, points: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Return the masks (n,) of the points (n, 3) that photograph `other` shows at an angle, between its ray and that of
+    """Return the mask (n,) of the points (n, 3) that photograph `other` shows at an angle, between its ray and that of
     photograph `number`, within `ANGLES_DEG`; and the angles (n,), [degrees]."""
     towards, away = (photographs.centres[each] - points for each in (number, other))
     lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
@@ -298,11 +298,13 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
 
 def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Return the pixels that other photographs are expected to show, and limits of their differences from these pixels.
+
     `at_best` (photographs, c, h, w) is what the others show at each pixel on the plane on which patches correlate best;
     `_OUTSIDE` if they correlate by less than `LEAST_CORRELATION`. The expected pixels, of the same shape, are the
     view's own brightness times the median ratio, or its temperature plus the median difference, over all pixels. The
     limits, (photographs, c, 1, 1), are `ALIKE` robust standard deviations of `at_best` from the expected pixels;
-    infinite if fewer than `_FEWEST_ALIKE` pixels are known. Masked pixels of the result are far below 0."""
+    infinite if fewer than `_FEWEST_ALIKE` pixels are known. Masked pixels of the result are far below 0.
+    """
     expected = np.broadcast_to(view.channels, at_best.shape).copy()
     limit = np.full((*at_best.shape[:2], 1, 1), np.inf, np.float32)
     for number, channel in np.ndindex(*at_best.shape[:2]):

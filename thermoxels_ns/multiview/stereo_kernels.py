@@ -74,11 +74,13 @@ def weigh_patches(features, channels, radius, likeness, least_weight, noise, wei
 @kernel(fastmath={"contract"})
 def correlate(channels, others, radius, weights, means, variances, noise, count, plane, result):
     """Write the mean correlation of each pixel with the best `count` of `others` to ``result[row, column, plane]``.
+
     `others` (photographs, c, h, w) are photographs drawn onto the pixels of `channels` (c, h, w); `result` is (h, w,
     planes). `radius`, `weights`, `means`, `variances` and `noise` are those of `weigh_patches`. A correlation is
     normalised cross-correlation of weighted patches with `noise` added to both variances. Channels are averaged by
     their ratio of signal to noise. A channel is left out for a photograph whose patch is masked (below 0) at a corner
-    or in the middle. A photograph without a channel that has a variance counts as `OUTSIDE`."""
+    or in the middle. A photograph without a channel that has a variance counts as `OUTSIDE`.
+    """
     kinds, height, width = channels.shape
     inner = width - 2 * radius
     scores, known = np.empty((len(others), inner), np.float32), np.empty((len(others), inner), np.bool_)
@@ -136,11 +138,13 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 
 @kernel(fastmath={"contract"})
 def add_differences(others, expected, limit, weight, count, plane, cost):
-    """Add to ``cost[row, column, plane]`` `weight` times the mean difference of the best `count` of `others`. The
-    difference of a photograph is the mean over channels of |others - expected| / limit, each at most 1. `others` and
-    `expected` are (photographs, c, h, w), and `limit` is (photographs, c, 1, 1). A channel is left out if its limit is
-    infinite, if `expected` is masked (below -1), or if the other photograph has no temperature (below 0). A photograph
-    that shows no brightness (below 0), or has no channel left, has the difference 1."""
+    """Add to ``cost[row, column, plane]`` `weight` times the mean difference of the best `count` of `others`.
+
+    The difference of a photograph is the mean over channels of |others - expected| / limit, each at most 1. `others`
+    and `expected` are (photographs, c, h, w), and `limit` is (photographs, c, 1, 1). A channel is left out if its limit
+    is infinite, if `expected` is masked (below -1), or if the other photograph has no temperature (below 0). A
+    photograph that shows no brightness (below 0), or has no channel left, has the difference 1.
+    """
     total, kinds, height, width = others.shape
     best = np.empty(count, np.float32)
     for row in range(height):
@@ -163,10 +167,12 @@ def add_differences(others, expected, limit, weight, count, plane, cost):
 
 @kernel(fastmath={"contract"})
 def aggregate(cost, features, small, large, edge, total):
-    """Write the mean over eight directions of the least path costs to `total` (semi-global matching). This is eq. 13 of
-    Hirschmueller 2008. Between two pixels of a path, a change of one plane costs `small`. A larger change costs `large`
-    / (1 + d / `edge`), but at least `small`, with d the difference of the two pixels' `features` (h, w, f). `cost` (h,
-    w, planes) is the cost of each pixel and plane alone; `total` has the same shape."""
+    """Write the mean over eight directions of the least path costs to `total` (semi-global matching).
+
+    This is eq. 13 of Hirschmueller 2008. Between two pixels of a path, a change of one plane costs `small`. A larger
+    change costs `large` / (1 + d / `edge`), but at least `small`, with d the difference of the two pixels' `features`
+    (h, w, f). `cost` (h, w, planes) is the cost of each pixel and plane alone; `total` has the same shape.
+    """
     rows, columns, planes = cost.shape
     total[:] = 0.0
     path = np.empty((2, columns, planes), np.float32)

@@ -1,1 +1,1 @@
-"""Rays to pixels: sampling, compositing and their compiled twins."""
+"""Volume rendering of rays: sampling and compositing, in plain torch and in compiled kernels."""

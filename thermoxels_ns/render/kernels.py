@@ -89,7 +89,7 @@ class Settings(NamedTuple):
 
 
 class Records(NamedTuple):
-    """One record per sample in a kept voxel, ray after ray; a ray has none behind its stop by `Settings.early_stop`.
+    """One record per sample in a kept voxel, ray after ray, up to where `Settings.early_stop` ends the ray.
     Each range of rays has a part of the arrays for itself, so unused records may lie between ranges."""
 
     offset: Ints  # First record of each ray, (rays,) int64
@@ -162,10 +162,12 @@ def path_of(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
-    """Return the first sample of a ray, from step number `i` on, that lies in a kept voxel. The ray `path`, from
-    `path_of`, enters the box at distance `enter` and has `length` in it; steps have length `step`. Returns number of
-    the step (-1: no sample), number of the voxel, distance, length of the step, and place (x, y, z) in the voxel, each
-    0 to 1."""
+    """Return the first sample of a ray, from step number `i` on, that lies in a kept voxel.
+
+    The ray `path`, from `path_of`, enters the box at distance `enter` and has `length` in it; steps have length `step`.
+    Returns number of the step (-1: no sample), number of the voxel, distance, length of the step, and place (x, y, z)
+    in the voxel, each 0 to 1.
+    """
     (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
     h = volume.size
@@ -200,7 +202,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
 
 @kernel
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
-    """Write the first `count` spherical harmonics in the direction of ray `r`, times `scale`, into `basis`."""
+    """Write the first `count` (1, 4, 9) spherical harmonics in the direction of ray `r`, times `scale`, to `basis`."""
     basis[0] = Y00 * scale
     if count > 1:
         x, y, z = float(directions[r, 0]), float(directions[r, 1]), float(directions[r, 2])
@@ -282,11 +284,15 @@ def march_rays(
     begin: int,
     end: int,
 ):
-    """Compute the weights of the samples of rays `first` to before `last` (paper, eq. 1). Writes records `begin` to
-    before `end`, and all of `sums` but colour and temperature, which are summed in double precision. Returns the number
-    of rays with a NaN density and the index behind the last record written. The number is -1 if there are too few
-    records. Threads share a batch: each has a range of rays and a range of records. `AHEAD` samples are read together,
-    so that their loads from memory overlap."""
+    """Compute the weights of the samples of rays `first` to before `last` (paper, eq. 1).
+
+    Writes records `begin` to before `end` and, summed in double precision, all of `sums` but colour and temperature.
+    Threads share a batch: each has a range of rays and a range of records. `AHEAD` samples are read together, so that
+    their loads from memory overlap.
+
+    Returns:
+        Number of rays with a NaN density (-1: too few records), and index of the last record written plus 1.
+    """
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
     n = begin
@@ -365,9 +371,11 @@ def prefetch_colours(values: Floats, rows: Ints, number: int):
 
 @kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
-    """Write colour and temperature of rays `first` to before `last` to `sums` (paper, eq. 1 and 2). The samples' own
-    values are written to `records`, which `march_rays` must have filled. A ray that does not want a value gets 0.
-    Samples of at most `Settings.smallest_weight` are left out."""
+    """Write colour and temperature of rays `first` to before `last` to `sums` (paper, eq. 1 and 2).
+
+    The samples' own values are written to `records`, which `march_rays` must have filled. A ray that does not want a
+    value gets 0. Samples of at most `Settings.smallest_weight` are left out.
+    """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3
     one = volume.density.dtype.type

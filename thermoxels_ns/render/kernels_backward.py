@@ -58,10 +58,12 @@ def find_sample_gradients(
     samples: SampleGradients,
 ):
     """Write the gradients for the samples of rays `first` to before `last` to `samples`, which overwrites `records`.
-    `grads` are the gradients for the results of the rays, and `depth` (rays,) is `Sums.depth`. With x_i the optical
-    depth of step i, w_i = T_i (1 - exp(-x_i)) and T_{i+1} = T_i exp(-x_i), the gradient is dL/dx_i = g_i T_{i+1} -
-    sum_{j>i} g_j w_j - g_T T_end, with g_i = dL/dw_i and g_T = dL/dT_end. The depth of a ray is d = sum_i w_i t_i /
-    sum_i w_i, so that it adds dL/dd (t_i - d) / sum_j w_j to g_i."""
+
+    `grads` are the gradients for the results of the rays, and `depth` (rays,) is `Sums.depth`. Let x_i be the optical
+    depth of step i, w_i = T_i (1 - exp(-x_i)) and T_{i+1} = T_i exp(-x_i), g_i = dL/dw_i and g_T = dL/dT_end. Then
+    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end. The depth of a ray is d = sum_i w_i t_i / sum_i w_i and
+    adds dL/dd (t_i - d) / sum_j w_j to g_i.
+    """
     channels = volume.sh.shape[1]
     for r in range(first, last):
         start, used = records.offset[r], records.used[r]
@@ -199,7 +201,8 @@ def first_voxel(voxel_rows: Ints, corner: int, row: int):
 def use_rows(
     first_row: int, last_row: int, volume: Volume, samples: SampleGradients, order: Order, blocks: Blocks, uses: Ints
 ):
-    """Write `RowGradients.uses`, for samples and variation, of rows `first_row` to before `last_row` to `uses`."""
+    """Write `RowGradients.uses` of rows `first_row` to before `last_row` to `uses`: bits for the parameters that get a
+    gradient from samples or from the total variation of `blocks`."""
     rows = volume.voxel_rows
     uses[first_row:last_row] = 0
     begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
@@ -228,8 +231,10 @@ def _groups_before(number: int, order: Order):
 @kernel
 def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
     """Give each row from `first_row` to before `last_row` with a gradient for parameter `kind` a place in `sums`.
-    `kind` is 0, 1 or 2 for density, colour or temperature. Places are successive from `at` on. They are written to
-    `rows.place`, the numbers of the rows to `listed`, and 0 to `sums` (places, columns)."""
+
+    `kind` is 0, 1 or 2 for density, colour or temperature. Places are successive, beginning with `at`. Written in place
+    are ``rows.place[row, kind]``, the row's number in ``listed[place]``, and zeros in ``sums[place]``.
+    """
     for row in range(first_row, last_row):
         if rows.uses[row] & (1 << kind):
             rows.place[row, kind], listed[at] = at, row
@@ -278,9 +283,11 @@ def add_samples(
     order: Order,
     rows: RowGradients,
 ):
-    """Add the gradients of samples, in the sequence of `order`, to the sums in `rows`. Only sums of the rows
-    `first_row` to before `last_row` are changed. As no other thread adds to these rows, the sums have the same bits for
-    any number of threads."""
+    """Add the gradients of samples, in the sequence of `order`, to the sums in `rows`.
+
+    Only sums of the rows `first_row` to before `last_row` are changed. As no other thread adds to these rows, the sums
+    have the same bits for any number of threads.
+    """
     count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
     dtype = volume.density.dtype
     basis, thermal_basis = np.empty(9), np.empty(9)
@@ -339,9 +346,13 @@ def add_samples(
 
 @kernel(fastmath={"contract"})
 def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
-    """Return the sum of sqrt(dx^2 + dy^2 + dz^2 + smallest) over voxels `first` to before `last` and all channels. dx,
-    dy, dz are the differences of `values` (rows, channels) between a voxel's lowest corner and the corners one step
-    along x, y, z. These rows are columns 0, 2 and 1 of `voxel_rows`, and column 0 plus 1 for z (see `KeptVoxels`)."""
+    """Return the sum of sqrt(dx^2 + dy^2 + dz^2 + smallest) over voxels `first` to before `last` and all channels.
+
+    dx, dy and dz are the differences of `values` (rows, channels) between a voxel's lowest corner and the corners one
+    step along x, y and z. In `voxel_rows` (voxels, 4), column 0 is the row of the lowest corner, column 1 of its
+    neighbour along y, column 2 of its neighbour along x. The neighbour along z has the row of column 0 plus 1.
+    `smallest`, above 0, keeps the gradient finite where all differences are 0.
+    """
     channels = values.shape[1]
     tiny = values.dtype.type(smallest)
     totals = np.zeros(channels)
@@ -369,9 +380,11 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the gradient of the loss by total variation, with respect to the parameter `values`, to `gradient`. `kind` is
-    0, 1 or 2 for density, colour or temperature. The rows are `first_row` to before `last_row`; the sum of a row lies
-    in ``gradient[place[row, kind]]``. See `total_variation` for `values` and `voxel_rows`."""
+    """Add the gradient of `blocks.push[kind]` times `total_variation`, with respect to its `values`, to `gradient`.
+
+    Only rows `first_row` to before `last_row` are changed; the sum of a row lies in ``gradient[place[row, kind]]``.
+    `kind` is 0, 1 or 2 for density, colour or temperature, of which `values` are the rows.
+    """
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type

@@ -24,8 +24,8 @@ LEAST_LIGHT = 0.003  # The surroundings of a ray are rendered if more than this 
 
 
 def choose_backend(backend: Backend, device: torch.device) -> Literal["reference", "fused"]:
-    """Return the backend for a device: auto is fused on a CPU, else reference. Raise `ThermoxelsError` for fused on
-    another device than a CPU."""
+    """Return the backend for a device: auto is fused on a CPU, else reference. Raise `ThermoxelsError` for fused on a
+    device other than a CPU."""
     if backend == "fused" and device.type != "cpu":
         remedy = "Pass --pipeline.model.backend auto, or --machine.device-type cpu."
         got = "fused, whose kernels run on the CPU"

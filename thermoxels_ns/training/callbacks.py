@@ -29,7 +29,7 @@ from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.plain_areas import PlainAreas
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
-FEWEST_OPEN_RAYS = 0.002  # A background stays if at least this share of rays leaves the box with half of its light
+FEWEST_OPEN_RAYS = 0.002  # A background is kept if at least this share of rays leaves the box with half of its light
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
 MOST_OPENED_RAYS = 0.01  # Largest share, of the rays of opacity above one half, that pruning may open
@@ -224,10 +224,10 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
 
     A voxel is needed if some ray of either stream gives it more than `threshold` of its light, or if a ray of opacity
     above one half completes half of its weight in it (else soft surfaces would open). Needed voxels, voxels up to
-    `dilation` voxels away from them, and opaque neighbours of them are kept: these rays miss some voxels of a fine
-    surface, and each would be a hole. If this opens more than the share `MOST_OPENED_RAYS` of the rays, the threshold
-    is divided by 4 and the pruning tried again. Raises `PruningError`, without a change of the grid, if even the last
-    of `PRUNING_ATTEMPTS` thresholds would open more.
+    `dilation` voxels away from them, and opaque neighbours of them are kept: the rays of statistics miss some voxels of
+    a fine surface, and each would be a hole. If this opens more than the share `MOST_OPENED_RAYS` of the rays, the
+    threshold is divided by 4 and the pruning tried again. Raises `PruningError`, without a change of the grid, if even
+    the last of `PRUNING_ATTEMPTS` thresholds would open more.
     """
 
     def rays():
@@ -257,10 +257,8 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
 
 @torch.no_grad()
 def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
-    """Switch off a background that the scene does not need, and log which background was chosen and why.
-
-    The decision is repeated at every change of the lattice, because surfaces may form late.
-    """
+    """Switch off a background that the scene does not need, and log which background was chosen and why. The decision
+    is repeated at every change of the lattice, because surfaces may form late."""
     config, field = model.config, (model.grid, model.sample_rays)
     rgb_on, thermal_on, _ = model.backdrop_on.tolist()
     if config.background == "auto" and rgb_on:

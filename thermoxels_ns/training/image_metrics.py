@@ -50,10 +50,8 @@ def psnr_of_blocks(
 
 
 def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, " 3"]:
-    """Return the gain of each channel, (3,), with which rendered pixels best fit measured ones (robust, Huber).
-
-    Values of at least `SATURATED` in the measured photograph do not count.
-    """
+    """Return the gain of each channel, (3,), with which rendered pixels best fit measured ones (robust, Huber). Values
+    of at least `SATURATED` in the measured photograph do not count."""
     gain, weight = torch.ones(3, device=predicted.device), (target < SATURATED).to(predicted.dtype)
     for _ in range(8):
         gain = (weight * predicted * target).sum(0) / (weight * predicted**2).sum(0).clamp(min=1e-12)
@@ -65,10 +63,8 @@ def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 def ssim(
     predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"], valid: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Return the structural similarity (Wang et al. 2004) with a Gaussian window of 11 pixels.
-
-    Smaller images have a box window. The mean is over windows whose pixels are all valid; NaN without such a window.
-    """
+    """Return the structural similarity (Wang et al. 2004) with a Gaussian window of 11 pixels. Smaller images have a
+    box window. The mean is over windows whose pixels are all valid; NaN without such a window."""
     side = min(11, *predicted.shape[:2])
     side -= 1 - side % 2
     images = (predicted.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])

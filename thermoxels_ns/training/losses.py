@@ -32,20 +32,16 @@ def thermal_loss(predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"]) 
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
-    """Return the first number and the last number plus 1 of a random block of about `share` of all kept `voxels`.
-
-    Kept voxels are numbered slab by slab along x, so that a block is contiguous in space too.
-    """
+    """Return the first number and the last number plus 1 of a random block of about `share` of all kept `voxels`. Kept
+    voxels are numbered slab by slab along x, so that a block is contiguous in space too."""
     length = min(voxels, max(1, math.ceil(share * voxels)))
     first = int(torch.randint(voxels - length + 1, (), generator=generator))
     return first, first + length
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
-    """Return the mean of log(A + guard) + log(1 - A + guard) over opacities A, shifted to be 0 for A of 0 or 1.
-
-    This term pushes rays to be opaque or empty (Neural Volumes; Plenoxels).
-    """
+    """Return the mean of log(A + guard) + log(1 - A + guard) over opacities A, shifted to be 0 for A of 0 or 1. This
+    term pushes rays to be opaque or empty (Neural Volumes; Plenoxels)."""
     decided = math.log(guard) + math.log(1.0 + guard)
     return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
 

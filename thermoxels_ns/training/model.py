@@ -404,9 +404,11 @@ class ThermoxelsModel(Model):
         self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
     ) -> dict[str, float]:
         """Return ``psnr_fitted``: the PSNR of a held-out frame with fitted gains and, if there is one, fitted pose.
+
         Gains are fitted to all pixels in the mask. If the batch has a camera fitted to the frame's own features, the
         frame is rendered from there, and ``thermal_mae_debiased_c`` is returned too. `outputs` and `seen` are the
-        photograph and the thermal image as rendered from the given poses; `valid` are the measured thermal pixels."""
+        photograph and the thermal image as rendered from the given poses; `valid` are the measured thermal pixels.
+        """
         metrics: dict[str, float] = {}
         if batch.get("fitted_camera") is not None:
             outputs = self._rendered(batch["fitted_camera"], RGB_STREAM | THERMAL_STREAM)

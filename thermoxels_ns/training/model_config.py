@@ -94,16 +94,16 @@ class ThermoxelsModelConfig(ModelConfig):
     """Steps of a whole training, over which refine-at and prune-at are spread where voxel-pixels asks for another
     number of resolutions. A quality sets this number; --max-num-iterations alone does not."""
     prune_at: tuple[int, ...] = _STANDARD.prune_at
-    """Steps, beside those of refine-at, at which voxels that hold little of each ray go, see prune-threshold."""
+    """Steps, beside refine-at, at which voxels that hold little of each ray are dropped, see prune-threshold."""
     prune_threshold: float = 0.03
-    """A voxel stays if some training ray gave it more than this share of a pixel. 0 switches pruning off."""
+    """A voxel is kept if some training ray gave it more than this share of a pixel. 0 switches pruning off."""
     prune_dilation: int = 1
-    """Width, in voxels, of the margin kept around voxels that stay by prune-threshold, so that surfaces can move."""
+    """Width, in voxels, of the margin kept around voxels that prune-threshold keeps, so that surfaces can move."""
     thin_at: tuple[int, ...] = _STANDARD.thin_at
     """Steps at which surfaces are thinned: half-transparent voxels before and behind a surface are dropped."""
     thin_threshold: float = 0.05
-    """At a step of thin-at a voxel stays if some training ray gave it more than this share of a pixel or spent half of
-    its light there; opaque neighbours of such voxels stay too. 0 switches thinning off."""
+    """At a step of thin-at a voxel is kept if some training ray gave it more than this share of a pixel or spent half
+    of its light there; opaque neighbours of such voxels are kept too. 0 switches thinning off."""
 
     sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""

@@ -48,7 +48,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
     compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
     """Function from a pipeline to metrics of its surface, set by `config.py`; None: there are no such metrics."""
-    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10), which a checkpoint must have too
+    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10); a checkpoint must have the same
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.cpu_threads is not None and config.cpu_threads < 1:
@@ -82,7 +82,7 @@ class ThermoxelsPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks of nerfstudio and those of `coarse_to_fine_callbacks`."""
+        """Return the callbacks of nerfstudio, followed by the result of `coarse_to_fine_callbacks`."""
         # The module `callbacks` loads compiled kernels, which importing the configuration must not.
         from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks
 
@@ -204,9 +204,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
 def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
     """Return the content of a checkpoint, read by `torch.load` with ``weights_only=True``, so that no code can run.
-
-    Raises `CheckpointError` if the file cannot be read or contains anything but tensors and plain values.
-    """
+    Raises `CheckpointError` if the file cannot be read or contains anything but tensors and plain values."""
     try:
         return torch.load(path, **{**options, "weights_only": True})
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as problem:

@@ -34,10 +34,8 @@ def _sampled(
 def voxel_weights(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
 ) -> tuple[Float[Tensor, " voxels"], Bool[Tensor, " voxels"]]:
-    """Return for each kept voxel the largest weight of a sample in it, and whether some ray ends in it.
-
-    Only a ray of opacity above one half ends: at the sample that completes half of its weight.
-    """
+    """Return for each kept voxel the largest weight of a sample in it, and whether some ray ends in it. Only a ray of
+    opacity above one half ends: at the sample that completes half of its weight."""
     device = grid.density.device
     largest = torch.zeros(len(grid.voxels), device=device)
     ends = torch.zeros(len(grid.voxels), dtype=torch.bool, device=device)
@@ -62,10 +60,8 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 def share_of_rays_opened(
     grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]
 ) -> float:
-    """Return the share of rays that pruning to the voxels True in `keep` would open, of rays of opacity above 1/2.
-
-    A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
-    """
+    """Return the share of rays that pruning to the voxels True in `keep` would open, of rays of opacity above 1/2. A
+    ray is opened if more than half of its weight lies in voxels that are False in `keep`."""
     hit, opened = 0, 0
     for _, _, samples in _sampled(grid, sample, rays):
         lost = torch.zeros_like(samples.transmittance)

@@ -1,4 +1,4 @@
-"""Nerfstudio's trainer, with named qualities, checked options, and checkpoints that are complete or absent."""
+"""Nerfstudio's trainer, with named qualities, checked options, and checkpoints written wholly or not at all."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the known fields of a config.yml; its viewer's host gives way to the host typed, or to `LOCAL_HOST`."""
+        """Take the known fields of a config.yml; replace the viewer's host by the typed host, or by `LOCAL_HOST`."""
         known = {each.name for each in fields(self)}
         self.__dict__.update({name: value for name, value in state.items() if name in known})
         if "viewer" in state:
@@ -69,7 +69,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
 
     def set_experiment_name(self) -> None:
-        """Name the run by the folder of its scene, found for ``--data ..`` too, if no name is given."""
+        """If no name is given, name the run after the folder of its scene, also for ``--data ..``."""
         manager: Any = self.pipeline.datamanager
         data = manager.data
         if data is None and manager.dataparser.data != Path():  # --data behind thermal-data
@@ -126,7 +126,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             super().save_config()
 
     def check(self) -> None:
-        """Raise `ThermoxelsError` for a number out of range, and for a device that PyTorch does not find."""
+        """Raise `ThermoxelsError` if an option is out of range or PyTorch does not find the device."""
         manager: Any = self.pipeline.datamanager
         model: Any = self.pipeline.model
         rays = [f"{stream}_num_rays_per_batch" for stream in ("train", "thermal", "eval")]
