@@ -56,12 +56,9 @@ class Scene:
             **options: Options of the export with underscores, such as ``interior="hollow"``, ``wall_thickness=0.3`` or
                 ``region="all"``; see `thermoxels_ns.commands.export.ExportOptions`.
 
-        Returns:
-            Two blocks: "body" is an UnstructuredGrid with `temperature_c` and `observed` (1: measured) per point and
-            `region` per cell; "boundary" is a PolyData with `patch`, `area_m2`, `normal` and more per triangle.
-
-        Raises:
-            ThermoxelsError: An option is wrong, or nothing is solid.
+        Returns two blocks: "body" is an UnstructuredGrid with `temperature_c` and `observed` (1: measured) per point
+        and `region` per cell; "boundary" is a PolyData with `patch`, `area_m2`, `normal` and more per triangle. Raises
+        `ThermoxelsError` if an option is wrong or nothing is solid.
         """
         from threadpoolctl import threadpool_limits
 
@@ -120,11 +117,11 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
 
 
 def to_pyvista(mesh: AnyMesh, *, up: Sequence[float] | None = None) -> pv.MultiBlock:
-    """Return a mesh that `solve` takes as the blocks "body" and "boundary" that `Scene.mesh` describes.
+    """Return any mesh that `solve` takes as two blocks, "body" and "boundary"; `Scene.mesh` describes them.
 
-    A bare grid gets a boundary with the patches exterior-up, -side and -down and, around closed cavities, interior-up,
-    -side and -down; `up`, z by default, decides. To name patches yourself, set the cell array `patch` of the block
-    "boundary" to names. Raises `ThermoxelsError` if the mesh is not sound.
+    A grid without a boundary gets one with the patches exterior-up, -side and -down and, around closed cavities,
+    interior-up, -side and -down, by the direction `up`; None: as stored with the mesh, or else z. To name patches, set
+    the cell array `patch` of the block "boundary" to names. Raises `ThermoxelsError` if the mesh is not sound.
     """
     from thermoxels_ns.mesh.files.vtu import any_mesh, blocks_of
 
@@ -140,7 +137,7 @@ def solve(
     say: Callable[[str], None] = lambda _: None,
     **goals: Any,
 ) -> HeatRun:
-    """Let heat flow through a mesh in a heat scene, as ``thermoxels heat`` does.
+    """Return the heat flows and temperatures of a mesh in a heat scene, as ``thermoxels heat`` computes them.
 
     Args:
         mesh: A mesh of `Scene.mesh` or `to_pyvista`; a pyvista UnstructuredGrid of tetrahedra with a point array
@@ -149,7 +146,7 @@ def solve(
             `thermoxels_ns.heat.scene.HeatScene`.
         up: Direction that points up in the coordinates of the mesh. Default: what the mesh says, or else z.
         probes_m: Points whose temperature is followed, shape (p, 3), [m].
-        say: Called with lines of progress, such as `print`.
+        say: Function that receives lines of progress, such as `print`.
         **goals: Errors and memory allowed, such as ``tolerance_k=0.05``; see `thermoxels_ns.heat.solving.Goals`.
 
     Returns:

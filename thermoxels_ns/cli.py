@@ -54,11 +54,7 @@ class Synthetic:
     """Errors of cameras and poses, none unless given. The true errors are written to truth.json."""
 
     def main(self) -> None:
-        """Write the scene to `output_dir` and print the command that trains it.
-
-        Raises:
-            ThermoxelsError: An option is out of range or the folder cannot be used.
-        """
+        """Write the scene and print the command that trains it; `ThermoxelsError`: a wrong option or folder."""
         from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
         folder = write_scene(
@@ -83,14 +79,9 @@ Commands = tyro.conf.FlagConversionOff[
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a subcommand and return its exit status.
+    """Run a subcommand; `arguments` are the words after ``thermoxels``, None: the arguments of this process.
 
-    Args:
-        arguments: The words after ``thermoxels``; the arguments of this process if left out.
-
-    Returns:
-        The exit status: 0 on success, 130 after the user's interrupt; after an error, which is printed, that of
-        `errors.exit_status`.
+    Errors are printed. Returns the exit status: 0, 130 after the user's interrupt, or `errors.exit_status` of an error.
     """
     about = "RGB and thermal photographs to a solid with heat."
     try:

@@ -72,8 +72,8 @@ def allow_checkpoint_globals() -> None:
 def extend_commands() -> None:
     """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands look for all parts of a run at the start.
 
-    nerfstudio's scripts call ``tyro.cli`` when they start. Where the script of export, train, eval, render or viewer is
-    loaded, as a module or as ``__main__``, its name `tyro` is bound to a copy whose `cli`, our `_cli`, does this.
+    nerfstudio's scripts call ``tyro.cli`` when they start. In each script (export, train, eval, render, viewer) that is
+    loaded, as a module or as ``__main__``, the name `tyro` is bound to a copy of tyro whose `cli` is our `_cli`.
     Scripts that are loaded later are not changed.
     """
     main = sys.modules.get("__main__")
@@ -87,10 +87,11 @@ def extend_commands() -> None:
 
 
 def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = None, **kwargs: Any) -> Any:
-    """Return the command that `tyro.cli` parses; raise `CheckpointError` if it loads a run of which something lacks.
+    """Parse the words of an ``ns-*`` command as `tyro.cli` does, and return the command.
 
-    ns-export gets our subcommand too; with ns-train, options of our dataparser may stand anywhere after the method, and
-    --help shows one page, --help-all every option.
+    ns-export has our subcommand too. With ns-train, options of our dataparser may stand anywhere after the method,
+    --help shows one page, and --help-all shows every option. `f` is what `tyro.cli` parses into. Raises
+    `CheckpointError` if the command loads a run of which a file is missing.
     """
     words = sys.argv[1:] if args is None else list(args)
     stock = name == _EXPORTER and f is vars(script).get("Commands")
@@ -133,7 +134,7 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
 
 
 def _with_mesh_export(commands: Any) -> Any:
-    """Return ``Annotated[Union[...], markers]`` or ``Union[...]`` with our subcommand as one more member."""
+    """Return `commands`, ``Annotated[Union[...], markers]`` or ``Union[...]``, with our subcommand as a new member."""
     from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
@@ -144,9 +145,10 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """Compare the trained surface, and depths along held-out rays, with the exact scene; return figures by name.
+    """Return figures of the trained surface and of depths along held-out rays against the exact scene, by name.
 
-    See `geometry_metrics` and `depth_metrics`, which `training` may not import; no figures without an exact scene.
+    They are those of `geometry_metrics` and `depth_metrics`, which `training` may not import. The result is empty if
+    the scene is not known exactly or the comparison fails; the reason of a failure is printed.
     """
     from thermoxels_ns.core.lattice import input_from_world
     from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, load_known_truth

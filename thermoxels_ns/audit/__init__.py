@@ -1,4 +1,4 @@
-"""Answers from measured surface temperatures, with intervals; called as a function, it is `run.audit_mesh`."""
+"""Heat losses and U-values, with intervals, from measured surface temperatures; a call of it calls `run.audit_mesh`."""
 
 import sys
 from importlib import import_module

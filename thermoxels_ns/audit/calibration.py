@@ -1,9 +1,9 @@
 """Calibration: find the properties of walls for which computed surface temperatures agree with measured ones.
 
-The package `heat` computes heat flow through the mesh, with the conditions' film model on the photographed side and ISO
-6946 on the other side: steady, or with heat capacities from the beginning of the weather file on. Gauss-Newton's method
-finds the logarithms of the unknown properties with the least sum of squared differences, weighted by area (Beck and
-Arnold 1977, Parameter Estimation in Engineering and Science).
+The heat equation is solved in the mesh, with the conditions' film model on the photographed side and ISO 6946 on the
+other side: steady, or, with heat capacities, from the beginning of the weather file on. Gauss-Newton's method finds the
+logarithms of the unknown properties with the least sum of squared differences, weighted by area (Beck and Arnold 1977,
+Parameter Estimation in Engineering and Science).
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "capacity": "kJ/(m3 K)"}
-_BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
+_BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Used with a history of weather only
 _LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 4.0  # Shortest time step; longer ones are a quarter of the time to the survey
-_UNSEEN_DAY_K = 10.0  # How far air and sun before a file of less than a day may be off what its first hours say
+_UNSEEN_DAY_K = 10.0  # Least half range of the air before a weather file of less than a day, [K]
 _LINEAR = 1e-9  # Relative tolerance of the linear equations of a time step
-_TOLD_SHARE = 0.05  # Least share by which the air before the file may move a property without a sentence
+_TOLD_SHARE = 0.05  # If the air before the file changes a property by this share or more, `Calibration.doubt` says so
 _STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a property
 _MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Largest step and stopping step of logarithms; most steps
 _FAR = 4.0  # A property whose logarithm moves farther than this from the start is not determined
 _LEAST_K = 0.02  # Least change of surface temperatures, root mean square, if a property becomes e times as large
-_MOST_SPREAD = 0.5  # Largest standard deviation of a logarithm, by noise and drift alone, of a known property
+_MOST_SPREAD = 0.5  # Largest standard deviation by noise and drift of the logarithm of a determined property
 _SMALL_SHARE = 0.1  # Properties with a smaller share than this in a combination are not named
 _OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers that seed random errors
 
@@ -56,7 +56,7 @@ class Calibration:
     found: Mapping[str, Interval]  # Unknown properties by name, such as "conductivity of wall"; empty if refused
     units: Mapping[str, str]  # Unit of each property, known or unknown
     refused: str  # Sentences that say why no values are found; empty if values are found
-    moved_most_by: Mapping[str, str]  # By unknown property: the uncertain quantity that moves its value most
+    moved_most_by: Mapping[str, str]  # By unknown property: the uncertain quantity that changes its value most
     misfit_k: float  # Root mean square of measured minus computed surface temperature, weighted by area, [K]
     difference_k: FloatArray
     """Measured minus computed surface temperature, shape (f,), [K]; NaN for triangles outside the fit."""
@@ -65,9 +65,9 @@ class Calibration:
 
 
 def calibrated(conditions: Conditions, surface: AuditedSurface, draws: Draws) -> Calibration | None:
-    """Find the unknown properties of `Conditions.calibrate`; return None if the conditions have no `calibrate`.
+    """Return the unknown properties of `Conditions.calibrate`, fitted to the readings; None if there is no `calibrate`.
 
-    Raises `AuditError` or `HeatError` if mesh and model do not fit.
+    Raises `AuditError` or `HeatError` if mesh, model and weather file do not fit together.
     """
     asked = conditions.calibrate
     if asked is None:
@@ -149,10 +149,10 @@ class _Wall:
         return 0.0 if self.history is None else float(self.history["hours"][-1])
 
     def _history(self) -> dict[str, FloatArray]:
-        """Return hours since the beginning of the weather file, the ends of time steps, and means over each step.
+        """Return the weather at t times by name, (t,) each: `hours` since the file begins, and means of each column.
 
-        Airs are minus those at the survey, [K]. The first value is that before: the mean of the first day. The last is
-        that at the survey. Steps are the longer the earlier they are, as walls forget details first.
+        A mean is over the time step before its hour; the first value is the mean of the first day, the last the value
+        at the survey. Airs are minus those at the survey, [K]; sun is in [W/m2]. Earlier time steps are longer.
         """
         series = self.conditions.history()
         if "outside_c" not in series:
@@ -176,11 +176,11 @@ class _Wall:
         return found
 
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
-        """Return the temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
+        """Return the temperature of each triangle in `counted`, (c,), [C], for `values` of all properties by name.
 
-        The film on the photographed side is replaced by its tangent at the measured temperature. With a history, the
-        body begins in the steady state of the first day and is followed to the survey by backward Euler; what the
-        surface radiates to is then as much warmer or colder than at the survey as the air.
+        The film on the photographed side is that of draw 0 of `draws`, replaced by its tangent at `measured_c`, (c,),
+        [C]. With a history, the body begins in the steady state of the first day, and backward Euler steps lead to the
+        survey; the radiant temperature around then differs from that at the survey by as much as the air.
         """
         mesh, names = self.surface.mesh, np.array(self.surface.selection.patch_names)
         start_c = np.full(len(self.surface.counted), float(measured_c.mean()))
@@ -220,7 +220,7 @@ class _Wall:
         return found.temperature_c[-1][facets].mean(axis=1)
 
     def _photographed_side(self, draws: Draws, at_c: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return coefficient and air temperature, (s,) each, with which convection is the film's tangent at `at_c`."""
+        """Return (s,) coefficients, and air temperatures, of linear convection: the film's tangent at `at_c`, (s,)."""
         surface, upward = self.surface, self.surface.upward[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
         emissivity = every[surface.surface_entry[self.seen]]
@@ -255,7 +255,7 @@ def _at(times_s: FloatArray, values: FloatArray, _: object, time_s: float) -> Fl
 
 
 class _Fit:
-    """The least-squares fit for the stated values, and its change with every uncertain quantity."""
+    """The least-squares fit of m unknown properties for the stated values, and its change with uncertain quantities."""
 
     def __init__(self, wall: _Wall, draws: Draws) -> None:
         self.wall, self.draws = wall, draws
@@ -275,7 +275,11 @@ class _Fit:
         return measured - wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
-        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method in a trust region."""
+        """Return the logarithms of property over start with the least squares, (m,): Gauss-Newton in a trust region.
+
+        Sets `residual_k`, (c,), minus its Jacobian `slope`, (c, m), the eigenvectors `directions` of the weighted
+        J^T J, and `sensitive_k`, (m,): the root mean square change of temperature per unit step along each of them.
+        """
         root, steps = np.sqrt(self.weight), _STEP * np.eye(len(self.names))
 
         def residual(x: FloatArray) -> FloatArray:
@@ -307,7 +311,7 @@ class _Fit:
         )
 
     def _combination(self, direction: FloatArray, sensitive_k: float, units: Mapping[str, str]) -> str:
-        """Return a sentence on a combination of properties that readings do not tell: direction of logarithms (m,)."""
+        """Return a sentence on a combination of properties, `direction` of logarithms (m,), that is not determined."""
         share = direction / direction[np.argmax(np.abs(direction))]
         which = [n for n in np.argsort(-np.abs(share), kind="stable") if abs(share[n]) >= _SMALL_SHARE]
         named = [self.names[n] for n in which]
@@ -326,15 +330,15 @@ class _Fit:
         return f"{told}: their {what} is, {known}. Take one of the two as known."
 
     def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-        """Yield each patch and how much `gain`, (m, c), times residuals changes, (m,), if the patch reads 1 K more."""
+        """Yield each patch, and the change of `gain`, (m, c), @ residuals if its readings rise by 1 K, (m,)."""
         patch = self.wall.surface.selection.facet_patch[self.wall.counted]
         for number in np.unique(patch):
             yield int(number), gain[:, patch == number].sum(axis=1)
 
     def _noise(self, gain: FloatArray) -> FloatArray:
-        """Return the covariance, shape (m, m), of `gain` times residuals that noise in the readings of nodes causes.
+        """Return the covariance, shape (m, m), of `gain`, (m, c), @ residuals by independent noise of nodal readings.
 
-        A triangle's reading is the mean of three nodes; its variance is a third of the variance of a node.
+        The variance of a node is three times that of the residuals, as a triangle's reading is the mean of three nodes.
         """
         facets = self.wall.surface.mesh.facets[self.wall.counted]
         nodes, number = np.unique(facets, return_inverse=True)
@@ -342,7 +346,7 @@ class _Fit:
         return 3.0 * float(self.weight @ self.residual_k**2) * at_nodes @ at_nodes.T
 
     def _local_spread(self) -> FloatArray:
-        """Return the standard deviation along each direction due to noise and the patches' own errors, shape (m,)."""
+        """Return the standard deviation along each of `directions`, (m,), due to noise and the patches' own errors."""
         told = np.maximum(self.sensitive_k, 1e-12)
         gain = (self.directions.T / told[:, None] ** 2) @ (self.slope.T * self.weight)
         variance = np.diag(self._noise(gain)).copy()
@@ -352,11 +356,11 @@ class _Fit:
         return np.sqrt(variance)
 
     def spread(self) -> tuple[FloatArray, list[str], FloatArray]:
-        """Return the logarithms of the properties in every draw, (m, k), which quantity moves each property most, and
-        by how much the air before the weather file moves each, (m,).
+        """Return the logarithms of the properties in every draw, (m, k), the quantity that changes each property most,
+        and the change of each logarithm by the air before the weather file, (m,).
 
-        For each quantity that acts on all readings, the fit is repeated at both ends of its range; a parabola stands
-        for the values in between; of formulas each is tried. Effects of several quantities add up.
+        For each uncertain quantity that acts on all readings, the fit is repeated at both ends of its range, and a
+        parabola interpolates in between; for film formulas, the fit is repeated with each. The effects are added up.
         """
         gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
         off, count = self.wall.conditions.camera.repeatability.off_by, self.draws.count
@@ -388,7 +392,7 @@ class _Fit:
         return drawn, most, moved.get(_BEFORE, np.zeros(len(self.names)))
 
     def _uncertain(self) -> dict[str, FloatArray]:
-        """Return the draws of uncertain quantities that act on all readings: conditions and known properties."""
+        """Return the draws, (k,), of each inexact quantity that acts on all readings: conditions, known properties."""
         common = {name: values for name, values in self.draws.values.items() if not name.startswith("contact")}
         for number, (name, one) in enumerate(self.stated.items()):
             if name not in self.start:
@@ -396,7 +400,7 @@ class _Fit:
         return {name: values for name, values in common.items() if np.ptp(values) > 0.0}
 
     def _follow(self, gain: FloatArray, name: str, value: float) -> FloatArray:
-        """Return the logarithms that make `gain` times residuals 0 if a quantity has another value (Broyden)."""
+        """Return the logarithms, (m,), with `gain` @ residuals = 0 if quantity `name` is `value` (Broyden's method)."""
         common = name in self.draws.values
         draws = Draws({**self._first.values, name: np.array([value])}) if common else self._first
         known = {} if common else {name: value}

@@ -1,4 +1,4 @@
-"""Two surveys of one building: bring them into one system of coordinates, and say what changed, with intervals."""
+"""Compare two surveys of one building: align their meshes, and compute what changed, with intervals."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.yaml_records import as_record, raising
 
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
-_NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
+_NEAR_M = 0.3  # Largest distance of the same surface in both, [m]: more than insulation or errors of meshes move it
 _FACES = 0.7  # Least cosine between normals of the same surface
 _ONE_POSITION = "one position in which the meshes fit each other"
 _POSE_TOGETHER = "Compare surveys of the same building in metres, or pose the photographs of both together."
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
 _ALIGN_STEPS = 25  # Steps of each alignment
-_LIKE_BEST = 1.3  # A quite different position that fits as well, but for this factor, makes the alignment ambiguous
-_SEEN_SHARE = 0.2  # Least share of an element that the other survey has seen, too
-_OVERLAP = 0.5  # Least share of the smaller of two findings of one bridge that lies in the larger
+_LIKE_BEST = 1.3  # Alignment is ambiguous if another position has a mean distance below about this times the best one
+_SEEN_SHARE = 0.2  # Least share of an element that the other survey must have seen, too
+_OVERLAP = 0.5  # Two surveys found one bridge if both cores hold this share of the area of the smaller core
 
 State = Literal["in both", "appeared", "went"]
 
@@ -72,13 +72,13 @@ class Pose(NamedTuple):
     shift_m: FloatArray  # Shape (3,)
 
     def __call__(self, points_m: FloatArray) -> FloatArray:
-        """Return points, shape (n, 3), in the coordinates of the later mesh."""
+        """Return points of the earlier mesh, shape (n, 3), in the coordinates of the later mesh."""
         return points_m @ self.turn.T + self.shift_m
 
 
 @raising(AuditError)
 def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
-    """Return the `conditions` of an answers.json, without what a comparison does not need (limits, calibration)."""
+    """Return the conditions in the entry "conditions" of the answers.json `name`, without its keys in `unused`."""
 
     def known(value: Any) -> Any:
         if not isinstance(value, Mapping):
@@ -94,13 +94,11 @@ def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
 def compare(before: Audit, after: Audit, difference_k: float | None = None) -> Comparison:
     """Return what changed between two audits of one building.
 
-    Elements are the patches of the later survey, on the surface that both saw: readings of the earlier survey are
-    carried over to the triangles of the later mesh beside them. Losses are compared at `difference_k` between the airs,
-    by default that of the later survey, [K]. Emissivities, the film's factor and formula err alike in both.
-
-    Raises:
-        AuditError: One survey is from inside and one from outside, a temperature outside is not known, or no position
-            of the earlier mesh fits the later one.
+    Elements are the patches of the later survey, on the surface that both saw: each triangle of the later mesh takes
+    the earlier reading of the triangle nearest to it. Losses are those at `difference_k`, inside minus outside air, by
+    default as in the later survey, [K]. Errors of emissivities, film factor and formula are the same in both surveys.
+    Raises `AuditError` if sides or film models of the surveys differ, a temperature outside is not known, no position
+    of the earlier mesh fits the later one, or the surveys saw no common surface.
     """
     sides = (before.conditions.side, after.conditions.side)
     for one in (before.conditions, after.conditions):
@@ -133,7 +131,7 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     areas = np.array([second.area_m2[part].sum() for part in parts])
 
     def changed(name: str, at: IntArray, drawn: list[FloatArray], size: float, **more: Any) -> Change:
-        """Return a change from draws of what it was and is, (k,) each; `size`, [m2] or [m], makes a loss of it."""
+        """Return a change from draws before and after, (k,) each; draws times `size`, [m2] or [m], are in [W/K]."""
         x, y, z = np.average(second.centroid_m[at], axis=0, weights=second.area_m2[at]).tolist()
         change = interval_of(drawn[1] - drawn[0])
         loss = Interval(*(size * difference_k * one for one in (change.value, change.low, change.high)))
@@ -167,7 +165,7 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
 
 
 def _elements(surface: AuditedSurface, shared: BoolArray) -> tuple[dict[str, IntArray], tuple[str, ...]]:
-    """Return the `shared` triangles of each patch that the other survey saw, too, and names of patches it did not."""
+    """Return the triangles of each patch that both surveys saw (`shared`), and names of patches that one alone saw."""
     seen, alone, patch = dict[str, IntArray](), list[str](), surface.selection.facet_patch
     for number in np.unique(patch[surface.counted]):
         every, name = surface.counted & (patch == number), surface.selection.patch_names[number]
@@ -180,7 +178,7 @@ def _elements(surface: AuditedSurface, shared: BoolArray) -> tuple[dict[str, Int
 
 
 def _flows(audit: Audit, draws: Draws, surface: AuditedSurface, parts: list[IntArray]) -> tuple[FloatArray, FloatArray]:
-    """Return draws of flows per kelvin through parts of `surface`, and of what own readings add to these, (p, k)."""
+    """Return draws of flows per kelvin through parts of `surface`, and their own reading errors, (p, k), [W/K]."""
     conditions, draws = audit.conditions, with_references(audit.surface, audit.conditions, draws)
     found = Parts(conditions, surface, draws, parts)
     off_k = np.stack([draws.local(conditions.camera.repeatability.off_by, n) for n in range(len(parts))])
@@ -188,14 +186,15 @@ def _flows(audit: Audit, draws: Draws, surface: AuditedSurface, parts: list[IntA
 
 
 def _bridges(before: Audit, after: Audit, partner: IntArray) -> list[tuple[State, FoundDefect]]:
-    """Return the bridges of both surveys, on what both saw of the later mesh; one that both found is the later one.
+    """Return the bridges of both surveys, as triangles of the later mesh that both surveys saw.
 
-    `partner` is the triangle of the earlier mesh beside each of the later one, (f,), or -1.
+    A bridge of both is listed once, as the later survey found it. A bridge of one survey is left out if the other saw
+    less than half of its zone. `partner`, (f,), is the earlier mesh's triangle beside each of the later mesh, or -1.
     """
     area_m2 = after.surface.area_m2
 
     def carried(audit: Audit, to: Callable[[IntArray], IntArray]) -> Iterator[tuple[float, FoundDefect]]:
-        """Yield each bridge on the triangles that `to` returns, and their share of its zone."""
+        """Yield the share of a zone that both saw, and the bridge, carried by `to` to triangles of the later mesh."""
         for defect, one in zip(audit.defects, audit.found):
             if not defect.not_counted:
                 core, zone, calm = map(to, (one.core, one.zone, one.reference))
@@ -224,9 +223,9 @@ def _ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
 
 
 def _with_common(before: Conditions, after: Conditions, earlier: Draws) -> tuple[Draws, tuple[str, ...]]:
-    """Return draws of the later survey whose common quantities err as in `earlier`, and the names of these quantities.
+    """Return draws of the later survey, and the names of the quantities whose errors are the same as in `earlier`.
 
-    Emissivities, and the film's factor and formula, are common: whoever surveys twice uses the same ones.
+    They are emissivities, film factor and film formula, as far as both surveys state them as uncertain.
     """
     later = draw(after, _DRAWS, SEED + 1)
     values, common, stated, was = dict(later.values), list[str](), uncertain(after), uncertain(before)
@@ -243,14 +242,14 @@ def _with_common(before: Conditions, after: Conditions, earlier: Draws) -> tuple
 
 
 def _places(points_m: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return points in a space, shape (n, 6), in which surfaces that face another way are far from each other."""
+    """Return points beside scaled unit normals, (n, 6): surfaces near by that face another way are far apart there."""
     return np.concatenate([points_m, _NEAR_M * normal], axis=1)
 
 
 def _partners(surface: AuditedSurface, at: FloatArray, other: AuditedSurface, other_at: FloatArray) -> IntArray:
-    """Return for each triangle of a survey the nearest one of the other that faces the same way, or -1, (f,).
+    """Return for each triangle of `surface` the nearest triangle of `other` within `_NEAR_M` that faces the same way.
 
-    Both have to count; `at` and `other_at` are their `_places`.
+    The shape is (f,); -1: there is none. Both triangles must count. `at` and `other_at` are the `_places` of all.
     """
     which, others, found = np.flatnonzero(surface.counted), np.flatnonzero(other.counted), np.full(len(at), -1)
     nearest = others[KDTree(other_at[others]).query(at[which])[1]]
@@ -264,10 +263,10 @@ def _partners(surface: AuditedSurface, at: FloatArray, other: AuditedSurface, ot
 def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float, bool]:
     """Return the pose of the earlier mesh, the median distance of the surfaces, [m], and whether it had to be moved.
 
-    Only triangles that count and that photographs support take part. Where both meshes have the same coordinates, the
-    pose is the identity. Else points are moved onto planes (Chen and Medioni 1992), from `_TURN_DEG` steps around the
-    vertical, with the middles of both surfaces together; the worst third of the points is left out each time.
-    Raises `AuditError` if nothing fits, or if two positions fit as well.
+    Triangles that count and that photographs support are compared. If the meshes fit as they are, the pose is the
+    identity. Else it is the best point-to-plane iterative closest point alignment (Chen and Medioni 1992) of starts
+    `_TURN_DEG` apart around the vertical with equal centroids; each step ignores the worst third of the points.
+    Raises `AuditError` if no position fits, or if two positions fit about equally well.
     """
     (points, normals), (target, facing) = (_samples(one) for one in (before, after))
     tree = KDTree(_places(target, facing))
@@ -326,7 +325,7 @@ def _turned_deg(one: Pose, other: Pose) -> float:
 
 
 def _samples(surface: AuditedSurface, most: int = 3000) -> tuple[FloatArray, FloatArray]:
-    """Return centroids and normals of triangles that count and are supported, drawn by their area, (n, 3) each."""
+    """Return centroids and normals of `most` random triangles that count and are supported, by area, (n, 3) each."""
     which = np.flatnonzero(surface.counted & ~surface.unsupported)
     which = which if len(which) else np.flatnonzero(surface.counted)
     share = surface.area_m2[which] / surface.area_m2[which].sum()

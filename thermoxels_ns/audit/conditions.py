@@ -32,7 +32,7 @@ Hours: TypeAlias = Annotated[Measured, Unit("h")]
 Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
 
 Side = Literal["outside", "inside"]
-BALANCE = "balance"  # Film model: radiation to what each triangle sees, and convection by formulas that are drawn
+BALANCE = "balance"  # Film model: radiation to what each triangle sees, and convection by formulas drawn at random
 _WINDLESS = ("iso-6946-combined", "given")  # Film models that need no wind speed for an outer surface
 
 EXAMPLE = "conditions-example.yaml"
@@ -110,12 +110,12 @@ class Surroundings:
 class Film:
     """The model of heat exchange between surface and surroundings, with its uncertainty."""
 
-    model: str = BALANCE  # That, "given", or the name of a formula in `thermoxels_ns.audit.heat_flow.FILMS`
+    model: str = BALANCE  # `BALANCE`, "given", or the name of a formula in `thermoxels_ns.audit.heat_flow.FILMS`
     factor: Annotated[Measured, Unit("1", 0.0)] = Measured(1.0)
-    """Multiplies convection; all heat for dallo and iso-6946-combined."""
+    """Factor of convection; for dallo and iso-6946-combined, of convection and radiation."""
     coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection coefficient; model "given" only
     weights: dict[str, Annotated[float, Field(ge=0.0)]] = field(default_factory=dict)
-    """Model balance only: how often each formula of convection is drawn, by name; the others are not drawn."""
+    """Model balance only: relative frequency of each convection formula by name; unnamed formulas are never drawn."""
 
     def __post_init__(self) -> None:
         check_only_if("coefficient", self.coefficient, self.model == "given", f"model: {self.model}")
@@ -176,7 +176,7 @@ class Limits:
 
 @record(AuditError)
 class Measure:
-    """Something to be done to patches, which then have another U-value."""
+    """A measure of renovation, which gives some patches another U-value."""
 
     patches: Annotated[tuple[str, ...], Field(min_length=1)]  # Names or patterns of patches that were observed
     u: Annotated[Measured, Unit("W/(m2 K)", 0.0)]  # U-value afterwards
@@ -184,18 +184,18 @@ class Measure:
 
 @record(AuditError)
 class Energy:
-    """A climate, with the price and the carbon dioxide of heat, for the heat that a year takes."""
+    """What the heat of a year is computed from: a climate, price and carbon dioxide of heat, and measures."""
 
     degree_hours: Annotated[Measured, Unit("K d", 0.0, above=True)] | None = None
     """Inside minus outside air, summed over the hours of a year with heating, in K h or K d; in place of `climate`."""
     climate: str | None = None
     """Weather file of a year beside the conditions, .epw or csv with outside_c; in place of `degree_hours`."""
     inside: Air | None = None  # Temperature inside while it is heated, [degrees Celsius]; beside `climate`
-    heating_limit: Air | None = None  # Hours with a warmer outside air do not count, [degrees Celsius]; as `inside`
+    heating_limit: Air | None = None  # Hours with a warmer outside air do not count, [degrees Celsius]; with `climate`
     price: Annotated[Measured, Unit("/kWh")] | None = None  # Price of heat, in `currency`
     currency: str = ""
     co2: Annotated[Measured, Unit("kg/kWh")] | None = None  # Carbon dioxide per heat
-    measures: dict[str, Measure] = field(default_factory=dict)  # By name; each alone, on the envelope as it is
+    measures: dict[str, Measure] = field(default_factory=dict)  # By name; the savings of each are those of it alone
 
     def __post_init__(self) -> None:
         check_one(climate=self.climate, degree_hours=self.degree_hours)
@@ -272,14 +272,14 @@ class Calibrate:
 
 @record(AuditError)
 class Weather:
-    """A file of the weather before the survey; entries that say "weather" instead of a number take theirs from it."""
+    """A file of the weather before the survey; entries that say "weather" instead of a number get the file's value."""
 
     file: str
-    """File beside the conditions: csv, whose first line names hours (0: the survey) and columns of `COLUMNS`, or .epw
-    of the year of the survey, whose date has to be stated."""
+    """File beside the conditions. Either a csv, whose first line names hours (0: the survey) and columns of `COLUMNS`;
+    or an .epw of the year of the survey, which needs `Survey.date`."""
     time_constant: Annotated[Measured, Unit("h", 0.0, above=True)] | None = None
-    """Time in which a change of the air fades in the walls, [h]; the audit then says what they still remember."""
-    absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Of the walls for sunlight
+    """Time constant of the walls, [h]; with it the audit states the effect of stored heat, `Audit.remembered`."""
+    absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Share of sunlight that walls absorb
     facing: Annotated[Measured, Unit("degrees")] | None = None
     """Direction that the walls face, clockwise from north, for the sunlight of an .epw file; None: all around."""
 
@@ -341,14 +341,14 @@ class Conditions:
         return math.isfinite(self.outside.air.value)
 
     def history(self) -> dict[str, FloatArray]:
-        """Return `survey_weather` of `weather`, which must not be None; raises `AuditError` if the file is unfit."""
+        """Return the columns of `survey_weather`; raises `AuditError` if the file is unfit. `weather` must be given."""
         assert self.weather is not None
         facing = ALL_AROUND_DEG if self.weather.facing is None else (self.weather.facing.value,)
         return survey_weather(self.weather.file, self.survey.date, facing)
 
     @property
     def film_shares(self) -> FloatArray:
-        """How often each formula of `FILMS` is drawn, in its order; the shares add up to 1, those of "given" to 0."""
+        """Probability of each formula of `FILMS`, in the order there; the sum is 1, or 0 for the model "given"."""
         formulas, model = FILMS[self.side], self.film.model
         weights = self.film.weights or {
             name: one.weight if model == BALANCE else float(name == model) for name, one in formulas.items()

@@ -19,7 +19,7 @@ _DEVIATIONS = 3.0  # Least departure of a triangle, in standard deviations of th
 _CELL_M, _AROUND_M = 0.25, 1.25
 """Edge of the cells whose mean temperatures are taken, and radius within which their median is the background, [m]."""
 _SHORTH = 1.349  # Width of the shortest half of a normal distribution, in standard deviations
-_SURE = 2.0  # Somewhere a defect departs by at least this many times the least departure that counts
+_SURE = 2.0  # A triangle of each defect must depart by more than this many times the least departure that counts
 LEAST_AREA_M2 = 0.01  # Smallest area of the triangles of a defect that depart: a square decimetre
 _LEAST_TRIANGLES = 4  # Smallest number of the triangles of a defect that depart
 _STRAIGHT = 3.0  # Least ratio of length to width of a straight line
@@ -30,9 +30,9 @@ _WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}  # Largest reach of a 
 _FARTHEST_OUT_M = 2.0  # Triangles farther than this from the core never belong to its zone, [m]
 _GAP_M = 0.3  # Sets of triangles no farther apart than this belong to one defect, [m]
 _BLURRED_EDGES, _OWN_SHARE = 3.0, 0.2
-"""Within this many triangle edges of another patch a reconstruction mixes the temperatures of both; departures up to
-this share of the step between them are its own error. Chosen on the drawn house, where bridges depart by a third of it
-and false ones by a tenth, at 1.5 edges from the border."""
+"""Within this many triangle edges of another patch a reconstruction mixes the temperatures of both; a departure up to
+this share of the temperature step between both patches is an error of the reconstruction. Chosen on the drawn house,
+where 1.5 edges from the border bridges depart by a third of the step, and false bridges by a tenth."""
 _NEIGHBOURS = 64  # Number of undisturbed triangles whose mean normal stands for the undisturbed surface
 
 
@@ -52,21 +52,18 @@ class FoundDefect:
 
 
 def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float) -> list[FoundDefect]:
-    """Find defects: connected triangles whose temperature departs from the undisturbed temperature of their patch.
+    """Return defects: connected triangles whose temperature departs from the undisturbed temperature of their patch.
 
     A triangle departs if its temperature differs from the patch's `undisturbed_temperature` by the least departure: the
-    largest of three standard deviations, `least_k` and 0.1 K. Triangles whose difference from their `background_c`
-    passes the same test depart too: this finds defects weaker than slow changes over a wall. In every defect a
-    triangle departs by twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
+    largest of three standard deviations, `least_k` and 0.1 K. A triangle also departs if its difference from its
+    `background_c` passes the same test: this finds defects weaker than slow changes over a wall. At least one triangle
+    of a defect departs by twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
 
     Args:
         surface: The audited surface.
         surface_c: Corrected temperature of each triangle, shape (f,), [degrees Celsius].
         warm: True: search for warmer triangles (seen from outside); False: for colder ones (seen from inside).
         least_k: Smallest departure that counts, [K].
-
-    Returns:
-        Defects, in the order of their first triangle.
     """
     sure = surface.counted & ~surface.rim
     sign = 1.0 if warm else -1.0
@@ -130,9 +127,9 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
-    """Return the core of each defect: triangles of one patch that depart and are connected by edges or gaps of 0.3 m.
+    """Return the core of each defect: triangles of one patch that depart, connected by edges or across `_GAP_M`.
 
-    `share` is the departure of each triangle over the least departure that counts, shape (f,).
+    `share` is the departure of each triangle over the least departure, (f,). Too small or too weak cores are left out.
     """
     which = np.flatnonzero(share > 1.0)
     pairs, patch = _neighbours(surface, which), surface.selection.facet_patch
@@ -156,7 +153,7 @@ def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
 
 
 def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
-    """Return all pairs of triangles of one patch that share an edge, as indices into `which`, shape (p, 2)."""
+    """Return the pairs of triangles in `which` that share an edge and a patch, as indices into `which`, (p, 2)."""
     pairs = np.stack(group_sides(surface.mesh.facets[which]).pairs(), axis=1) // 3
     patch = surface.selection.facet_patch[which]
     return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]
@@ -221,11 +218,11 @@ class _Zones:
         )
 
     def _is_blurred(self, core: IntArray, spot: IntArray, reference: IntArray, edge_m: float) -> bool:
-        """Return whether a core departs by no more than a reconstruction errs beside a patch of another temperature.
+        """Return whether a reconstruction may have mixed a core's departure in from a patch of another temperature.
 
-        The core lies on average within `_BLURRED_EDGES` of the other patch, and its spot departs from the reference by
-        at most `_OWN_SHARE` of the step from the reference to what that patch reads next to it, or half of that share
-        where that patch departs the other way.
+        True if the core lies on average within `_BLURRED_EDGES` edges (length `edge_m`) of another patch, and its spot
+        departs from the reference by at most `_OWN_SHARE` of the step from the reference to the readings next to the
+        core on that patch; if that patch departs the other way, by at most half of this share.
         """
         surface, reach = self.surface, _BLURRED_EDGES * edge_m
         others = np.flatnonzero(surface.read & (self.patch != self.patch[core[0]]))
@@ -242,7 +239,10 @@ class _Zones:
         return abs(top - calm) <= _OWN_SHARE * float(np.maximum(step, -0.5 * step).max(initial=0.0))
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
-        """Return `near`, with the core itself, but without triangles of `same` that are nearer to another core."""
+        """Return `near`, whether triangles `same` are chosen, with the core and without those nearer to another core.
+
+        `same`, `near` and `distance`, [m], to the core have the shape (s,); all of `same` are on the core's patch.
+        """
         own, near = self.core_of[core[0]], near.copy()
         others = same[(self.core_of[same] >= 0) & (self.core_of[same] != own)]
         candidates = np.flatnonzero(near)
@@ -252,7 +252,7 @@ class _Zones:
         return near | (self.core_of[same] == own)
 
     def _hangs_together(self, core: IntArray, same: IntArray, near: BoolArray) -> BoolArray:
-        """Return `near` without triangles that no chain of shared edges within `near` connects to the core."""
+        """Return `near`, (s,), only where a chain of shared edges within `near` connects a triangle to the core."""
         chosen = np.flatnonzero(near)
         pairs = _neighbours(self.surface, same[chosen])
         component = component_of(len(chosen), pairs[:, 0], pairs[:, 1])
@@ -262,7 +262,8 @@ class _Zones:
         return found
 
     def _calm(self, same: IntArray, near: BoolArray, distance: FloatArray, reach: float) -> IntArray:
-        """Return undisturbed triangles around a zone; if they have less than half its area, all of the patch's."""
+        """Return the undisturbed triangles around the zone `near`; if their area is under half the zone's, all of the
+        patch outside the zone; if there are none, the patch outside the zone. For arguments see `_nearest`."""
         calm = ~near & ~self.departs[same]
         ring = calm & (distance <= 2.0 * reach + 0.5)
         wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
@@ -297,7 +298,7 @@ class _Zones:
         return np.where(length > 0.1, mean / np.maximum(length, 0.1), self.normal[which])
 
     def _width(self, core: IntArray) -> float:
-        """Return the width of a strip, [m], as four times the mean distance of its points from its edge."""
+        """Return the width of a core, [m]: four times the mean distance from its edge, which is exact for a strip."""
         facets, points = self.surface.mesh.facets[core], self.surface.mesh.points_m
         sides = group_sides(facets)
         alone = sides.order[sides.start[sides.sizes == 1]]
@@ -310,7 +311,7 @@ class _Zones:
 
 
 def _kind(footprint: FloatArray, area_m2: FloatArray, width_m: float, edge_m: float) -> tuple[DefectKind, float]:
-    """Return the kind of a defect and its length, [m], from the centroids of its core in the plane, shape (k, 2)."""
+    """Return the kind of a defect and its length, [m]; `footprint`: centroids of its triangles in a plane, (k, 2)."""
     centred = footprint - np.average(footprint, axis=0, weights=area_m2)
     _, axes = np.linalg.eigh((centred * area_m2[:, None]).T @ centred)
     along = centred @ axes[:, ::-1]

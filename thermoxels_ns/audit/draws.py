@@ -14,16 +14,16 @@ from thermoxels_ns.core.measured import Measured
 COUNT, SEED = 10_000, 20260115
 """Number of draws behind each interval (JCGM 101, 7.2), and the seed that makes them repeat for the same conditions."""
 FORMULA, REPEATABILITY, GEOMETRY = "film formula", "camera repeatability", "geometry"
-"""Causes of uncertainty that have no `Measured`; geometry: where borders of the reconstructed surface lie."""
-_COMMON_GEOMETRY = 6 * 10**6  # Argument `number` of `Draws.local` for the part of geometry that all parts share
+"""Causes of uncertainty that `uncertain` does not name; geometry: where borders of the reconstructed surface lie."""
+_COMMON_GEOMETRY = 6 * 10**6  # Argument `number` of `Draws.local` for the border error that all parts share
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
-ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)
+ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)  # Quantiles of the draws at the ends of an interval
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A number computed from the stated values, and the range that holds 90 % of the draws."""
+    """A number computed from the stated values, and the range that holds the middle 90 % of the draws."""
 
     value: float
     low: float
@@ -62,7 +62,7 @@ class Draws:
 
     values: Mapping[str, FloatArray]
     seed: int = SEED
-    without: tuple[str, ...] = ()  # Out of `REPEATABILITY` and `GEOMETRY`: those whose errors are 0
+    without: tuple[str, ...] = ()  # The causes among `REPEATABILITY` and `GEOMETRY` whose errors are 0 in all draws
 
     @property
     def count(self) -> int:
@@ -82,13 +82,16 @@ class Draws:
         return replace(self, values={name: values[: 1 + count] for name, values in self.values.items()})
 
     def frozen(self, cause: str) -> Draws:
-        """Return draws in which one cause has its stated value; `REPEATABILITY`, `GEOMETRY`: no such errors."""
+        """Return draws in which `cause` has its stated value; with `REPEATABILITY` or `GEOMETRY` its errors are 0."""
         if cause in (REPEATABILITY, GEOMETRY):
             return replace(self, without=(*self.without, cause))
         return replace(self, values={**self.values, cause: np.full(self.count, self[cause][0])})
 
     def local(self, off_by: float, number: int, cause: str = REPEATABILITY) -> FloatArray:
-        """Return random errors within +- `off_by`, (1 + k,), the first 0; each `number`, a seed, has its own errors."""
+        """Return uniform random errors in +- `off_by`, (1 + k,), the first 0; all are 0 if `cause` is in `without`.
+
+        `number` is part of the seed: other numbers give independent errors.
+        """
         if cause in self.without:
             return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
@@ -96,19 +99,19 @@ class Draws:
         return drawn
 
     def geometry(self, number: int) -> FloatArray:
-        """Return errors of where the borders of part `number` lie, in -1 to 1, shape (1 + k,), the first 0.
+        """Return relative errors of the border position of part `number`, from -1 to 1, shape (1 + k,), the first 0.
 
-        Half is common to all parts, as reconstructions round all edges alike; half is the part's own.
+        Half of each error is common to all parts, as reconstructions round all edges alike; half is the part's own.
         """
         numbers = _COMMON_GEOMETRY, _COMMON_GEOMETRY + 1 + number
         return np.mean([self.local(1.0, one, GEOMETRY) for one in numbers], axis=0)
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
-    """Draw `count` values of each uncertain quantity, one at random in each of `count` equal parts of its range.
+    """Return the stated value and `count` random values of each uncertain quantity (Latin hypercube sampling).
 
-    If several formulas are drawn, `FORMULA` is the place of one in `FILMS`, as often as its weight says; -1, the stated
-    value, stands for the mean of all.
+    If the balance uses several formulas, `FORMULA` holds the place of the drawn formula in `FILMS`, drawn with the
+    probabilities `film_shares`. Its stated value is -1, which stands for the mean of all formulas.
     """
     generator = np.random.default_rng(seed)
 
@@ -129,7 +132,7 @@ def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
 
 
 def causes(conditions: Conditions) -> list[str]:
-    """Return the names of all that makes results uncertain: quantities that are not exact, formula, repeatability."""
+    """Return the names of the causes of uncertainty but `GEOMETRY`: inexact quantities, formula, repeatability."""
     named = [name for name, what in uncertain(conditions).items() if what.off_by > 0.0]
     named += [FORMULA] * (conditions.film.model == BALANCE and bool(conditions.film_shares.max() < 1.0))
     return named + [REPEATABILITY] * (conditions.camera.repeatability.off_by > 0.0)

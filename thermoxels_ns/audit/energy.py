@@ -22,7 +22,7 @@ LEAVES_OUT = (
     "efficiency of the heating, and all surface that was not observed. U-values are those of the survey, with its wind "
     "and sky. So this is heat through the observed surface, not the demand of the building."
 )
-_YEAR_H, _MOST_OFF_H = 8766.0, 48.0  # Hours of a mean year, and by how much the years of a climate may be off
+_YEAR_H, _MOST_OFF_H = 8766.0, 48.0  # Hours of a mean year; most hours by which a climate may differ from whole years
 _MOST_GAP_H = 24.0  # Longest time between two lines of a climate
 _OF_ENERGY = 10**6 + 1  # First argument `number` of `Draws.local`, larger than any part's number
 
@@ -51,10 +51,10 @@ class EnergyResult:
 def year_of(
     conditions: Conditions, draws: Draws, elements: Sequence[tuple[str, FloatArray, FloatArray]]
 ) -> EnergyResult | None:
-    """Return a year's heat, None if the conditions do not ask. `elements`: name, area, U-value of patches, (k,) each.
+    """Return heat, cost and carbon dioxide of a year, heat = U area degree hours; None if there is no `energy`.
 
-    heat = U area degree hours. Every draw has one climate, one price and one set of U-values for all elements, before
-    measures and after. Raises `AuditError` if the climate or the patches of a measure cannot be used.
+    `elements` are name, area, [m2], and U-value, [W/(m2 K)], of each patch, (k,) each. A draw has the same climate,
+    price and U-values before and after measures. Raises `AuditError` if the climate or a measure's patches are unfit.
     """
     asked = conditions.energy
     if asked is None:
@@ -89,7 +89,10 @@ def year_of(
 
 
 def _degree_hours(asked: Energy, drawn: Callable[[Measured], FloatArray]) -> FloatArray:
-    """Return draws of the degree hours of a year, (k,), [K h]: stated, or of the hours below the heating limit."""
+    """Return draws of the degree hours of a year, (k,), [K h]: stated, or summed over hours below the heating limit.
+
+    `drawn` returns draws of a stated value, (k,). Raises `AuditError` if the climate file is unfit.
+    """
     if asked.degree_hours is not None:
         return 24.0 * drawn(asked.degree_hours)
     assert asked.climate is not None and asked.inside is not None and asked.heating_limit is not None

@@ -1,4 +1,4 @@
-"""The envelope of an audited building for energy programs, with U-values, and as HBJSON."""
+"""The envelope of an audited building: the U-values of its flat elements, and its export as HBJSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHGC = 0.6
 """Share of the sun's heat that windows are assumed to let in: HBJSON demands a number that no thermal image tells."""
 _LEAST_R_M2K_W, _MOST_WINDOW_U = 0.001, 12.0  # Limits of HBJSON for a layer and for a window
 _R_M2K_W = {"roof": 0.14, "wall": 0.17, "door": 0.17, "floor": 0.21}
-"""Surface resistances of ISO 6946, both sides, [m2 K / W]: programs add such to those of layers."""
+"""Sum of both surface resistances of ISO 6946, [m2 K / W]; energy programs add them to the layers themselves."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class Envelope:
 
     building: Building
     u: Mapping[str, Interval | None]
-    """U-value of each element and opening by name, the mean over the area that counts, [W/(m2 K)]; None if nothing
-    counts, or if the air outside is not known."""
-    share: Mapping[str, float]  # Share of the triangles' area that counts, 0 to 1
+    """Mean U-value, [W/(m2 K)], of the triangles that count on each element and opening, by name; None if no triangle
+    counts, or if the air temperature outside is not known."""
+    share: Mapping[str, float]  # By the same names, share of the triangles' area that counts, 0 to 1
 
     def figures(self) -> dict[str, dict[str, Any]]:
-        """Return the figures of each element and opening by name, for json."""
+        """Return area, [m2], azimuth and tilt, [degrees], U-value and `share` of each element and opening by name."""
         return {
             one.name: {
                 **{name: round(getattr(one, name), 3) for name in ("net_area_m2", "azimuth_deg", "tilt_deg")},
@@ -43,7 +43,7 @@ class Envelope:
 
 
 def envelope_of(found: Audit, building: Building) -> Envelope:
-    """Return the envelope of the building that `find_building` found on the audited mesh."""
+    """Return U-values of the elements of `building`, which `find_building` must have found on the mesh of `found`."""
     conditions, surface = found.conditions, found.surface
     draws = with_references(surface, conditions, draw(conditions))
     which = {one.name: one.facets[surface.counted[one.facets]] for one in building.every()}
@@ -61,8 +61,8 @@ def envelope_of(found: Audit, building: Building) -> Envelope:
 def hbjson(envelope: Envelope, title: str) -> dict[str, Any]:
     """Return a model of one room by honeybee-schema 2.3 (HBJSON); x points east, y north and z up.
 
-    U-values become constructions of one layer without mass, less the surface resistances of ISO 6946. What was not
-    measured has none, so programs take their default. Figures and intervals are in `user_data`.
+    A U-value becomes a construction of one layer without mass, with the resistance 1 / U less the surface resistances
+    of ISO 6946; windows keep U. Elements without a U-value get a program's default. `user_data`: `Envelope.figures`.
     """
     building, figures = envelope.building, envelope.figures()
     materials, constructions = list[dict[str, Any]](), list[dict[str, Any]]()

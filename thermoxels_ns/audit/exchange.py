@@ -55,9 +55,9 @@ def exchange(conditions: Conditions, readings: Readings, draws: Draws, warmer_k:
 
 
 def triangle_exchange(conditions: Conditions, surface: AuditedSurface, draws: Draws) -> Exchange:
-    """Return the exchange of each boundary triangle by the stated values, (f,) each; NaN where one does not count.
+    """Return the exchange of each boundary triangle for the stated values, (f,) each; NaN: does not count.
 
-    Within a group of alike triangles it is linear in the reading.
+    Within a group of alike triangles, temperature and heat flow are linear in the reading.
     """
     groups, of = surface.alike
     low, mean, high = _around(conditions, groups, draws)
@@ -67,15 +67,15 @@ def triangle_exchange(conditions: Conditions, surface: AuditedSurface, draws: Dr
 
 
 def _around(conditions: Conditions, groups: Readings, draws: Draws) -> list[Exchange]:
-    """Return the stated exchange with readings lower by `HALF_STEP_K`, as they are, and higher by it."""
+    """Return the exchange for the stated values with readings minus `HALF_STEP_K`, as they are, and plus this step."""
     return [exchange(conditions, groups, draws.first(0), step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K)]
 
 
 class Parts:
-    """Parts of the surface, which are p sets of triangles that count, with their heat exchange in draws.
+    """The heat exchange of p parts of the surface in every draw; a part is a set of triangles.
 
-    Draws are computed for groups of alike triangles. By what the triangles of a part differ from the means of their
-    groups is computed from the stated values alone.
+    A draw is computed for groups of alike triangles. The difference between the triangles of a part and the means of
+    their groups is computed from the stated values alone, and is the same in every draw.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Parts:
         draws: Draws,
         which: Sequence[IntArray],
     ) -> None:
-        """Take the parts as indices of triangles."""
+        """Take the triangles of each part; the caller must leave out triangles that do not count."""
         self.conditions, (self.groups, of_triangle) = conditions, surface.alike
         row = np.repeat(np.arange(len(which)), [len(one) for one in which])
         every = np.concatenate([np.zeros(0, np.int64), *which])
@@ -94,7 +94,7 @@ class Parts:
         low, mean, high = _around(conditions, self.groups, draws)
         self.area_m2: FloatArray = np.asarray(self._rows.sum(axis=1), np.float64)  # Shape (p,), [m2]
         self.slope_w_k = (self._rows @ (high.flow_w_m2 - low.flow_w_m2))[:, 0] / (2.0 * HALF_STEP_K)
-        """Change of the stated flow per kelvin that all readings of a part are higher, shape (p,), [W/K]."""
+        """Derivative of the stated flow of a part with respect to a shift of all its readings, shape (p,), [W/K]."""
         self._off = [
             np.bincount(row, area * own[every], len(which))[:, None] - self._rows @ of_group
             for own, of_group in zip(triangle_exchange(conditions, surface, draws), mean)
@@ -103,7 +103,7 @@ class Parts:
     def in_draws(self, draws: Draws, first: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Return mean surface temperatures, [C], and heat flows from inside to outside, [W], (p, k) each.
 
-        Only the `first` parts are computed if their number is given.
+        If the number `first` is given, only that many parts are computed.
         """
         rows = self._rows[:first]
         surface_c, flow_w = (np.repeat(off[:first], draws.count, axis=1) for off in self._off)
@@ -119,13 +119,13 @@ class Parts:
 
 
 def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
-    """Return the emissivity and the reflected temperature, [K], set in the camera; 0 C if no temperature was stated."""
+    """Return emissivity and reflected temperature, [K], set in the camera, (k,) each; 0 C if none was stated."""
     reflected_c = draws.values.get("reflected temperature set in the camera", np.zeros(draws.count))
     return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
 
 
 def radiant_k4(conditions: Conditions, draws: Draws, upward: FloatArray) -> FloatArray:
-    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4]; `upward`: see `view_shares`."""
+    """Return the fourth power of the radiant temperature that surfaces see, (g, k), [K^4]; `upward`: `view_shares`."""
     if conditions.surroundings.sky is None:
         reflected_k4 = fourth_power(celsius_to_kelvin(draws["reflected temperature"]))
         return np.broadcast_to(reflected_k4, (len(upward), draws.count))
@@ -162,9 +162,10 @@ def film_flow_w_m2(
 
 
 def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
-    """Return the coefficient by the formula of each draw, shape (g, k); draws without one take the mean by shares.
+    """Return the convection coefficient by the formula that each draw has drawn, shape (g, k), [W/(m2 K)].
 
-    `warmer_k` is surface minus air, shape (g, k), `upward` the upward part of normals, shape (g, 1).
+    A draw without a formula takes the mean of all formulas, weighted by `Conditions.film_shares`. `warmer_k` is surface
+    minus air temperature, shape (g, k), [K]; `upward` is the upward part of outward unit normals, shape (g, 1).
     """
     drawn = draws.values.get(FORMULA, np.full(draws.count, -1.0))
     wind, found = draws.values.get("wind", np.zeros(draws.count)), np.zeros(warmer_k.shape)
@@ -176,10 +177,9 @@ def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray
 
 
 def most_u_w_m2k(surface: AuditedSurface, side: str) -> FloatArray:
-    """Return the U-value that the films of air on both sides allow without any wall, 1 / (Rsi + Rse) of ISO 6946, (f,).
+    """Return the largest possible U-value of each triangle, 1 / (Rsi + Rse) of ISO 6946: two films, no wall, (f,).
 
-    It follows from the direction in which heat flows through each triangle. A larger U-value is impossible: an input
-    clashes with the readings.
+    Rsi depends on the direction of the heat flow, up, down or level. A larger U-value contradicts the readings.
     """
     upward = surface.upward * (-1.0 if side == "outside" else 1.0)
     return 1.0 / (1.0 / FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward) + OUTSIDE_RESISTANCE_M2K_W)
@@ -188,9 +188,9 @@ def most_u_w_m2k(surface: AuditedSurface, side: str) -> FloatArray:
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:
     """Return draws whose "camera offset" is computed from the contact temperatures; without references, `draws`.
 
-    The offset is the correction with which readings near a reference give the temperature measured there; for several
-    references it is the mean correction. Errors of emissivity and reflection then largely cancel elsewhere.
-    Raises `AuditError` if no triangle that counts is near a reference.
+    The offset makes the corrected readings near a reference equal to the temperature measured there. Of several
+    references, the mean offset is taken. Errors of emissivity and reflection then largely cancel elsewhere.
+    Raises `AuditError` if no triangle that counts is within `_FARTHEST_M` of a reference.
     """
     if not conditions.references:
         return draws
@@ -210,7 +210,7 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
 
 
 def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
-    """Return one sentence if the offset in `draws`, from `with_references`, is outside its stated range; else none."""
+    """Return a sentence if all offsets in `draws`, from `with_references`, are outside the stated range; else none."""
     stated, found = conditions.camera.offset, draws["camera offset"]
     if not conditions.references or (stated.low <= found.max() and found.min() <= stated.high):
         return ()
@@ -221,7 +221,7 @@ def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
 
 
 def _near(surface: AuditedSurface, conditions: Conditions, number: int) -> IntArray:
-    """Return the triangles that count around reference `number`, all on the patch of the nearest triangle."""
+    """Return the triangles that count within `_AROUND_M` of reference `number`, on the nearest triangle's patch."""
     at = np.array(conditions.references[number].at)
     counted = np.flatnonzero(surface.counted)
     distance = np.linalg.norm(surface.centroid_m[counted] - at, axis=1)

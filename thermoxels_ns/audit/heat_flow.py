@@ -26,7 +26,7 @@ def fourth_power(values: Values) -> Values:
 
 
 def net_radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k4: Values) -> Values:
-    """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011).
+    """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4), by Fokaides and Kalogirou (2011).
 
     `surroundings_k4` is the fourth power of the temperature of the surroundings, [K^4].
     """
@@ -50,12 +50,12 @@ def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
 class FilmFormula(NamedTuple):
     """A published formula for the heat exchange between a surface and the air."""
 
-    weight: float  # How often the balance draws it, if the conditions name no weights
+    weight: float  # Relative frequency with which the balance draws the formula if the conditions name no weights
     w_m2k: Callable[[Values, Values, Values], Values]
-    """The coefficient, from the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the
-    upward part of its outward unit normal."""
+    """Function that returns the coefficient, [W/(m2 K)], from wind speed [m/s], surface minus air temperature [K], and
+    the upward part of the surface's outward unit normal."""
     radiates: Literal["seen", "air", "included"] = "seen"
-    """Radiation beside it: to what the surface sees, to surroundings as warm as the air, or within the coefficient."""
+    """Radiation is added to what the surface sees, added to surroundings at air temperature, or in the coefficient."""
 
 
 def _mowitt(factor: float, power: float) -> FilmFormula:
@@ -72,7 +72,7 @@ _COMBINED = {direction: 1.0 / resistance for direction, resistance in INSIDE_RES
 
 
 def _by_direction(w_m2k: Mapping[Any, float]) -> Callable[[Values, Values, Values], Values]:
-    """Return the coefficient in a room by the direction of the heat flow, which is up through surfaces facing down."""
+    """Return a formula for rooms that depends on the heat flow's direction: a surface facing down has flow "up"."""
     return lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [w_m2k["up"], w_m2k["down"]], w_m2k["horizontal"])
 
 
@@ -105,25 +105,25 @@ FILMS: Mapping[str, Mapping[str, FilmFormula]] = {
 }
 """Formulas by the side of the surface.
 
-Outside: iso-6946, 4 + 4 v (ISO 6946, annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
-(McAdams 1954), of one wind tunnel, with radiation and free convection in them, so that they are drawn only if weights
-name them; watmuff, 2.8 + 3 v, these without (Watmuff, Charters and Proctor 1977); mowitt, sqrt((0.84 dT^(1/3))^2 +
-(3.26 v^0.89)^2) windward and with 3.55 v^0.617 leeward (Yazdanian and Klems 1994, measured on windows; coefficients by
-Booten and others 2012, as in EnergyPlus); tarp, `natural_w_m2k` + 2.537 Rf sqrt(v P/A),
-half of the wind's part leeward (Sparrow and others 1979, Walton 1983), Rf 1.67 for brick, P/A 0.5 per metre; emmel,
-`natural_w_m2k` + 5.15 v^0.81 windward, 3.54 v^0.76 leeward (Emmel, Abadie and Mendes 2007, walls; sum as in
-EnergyPlus). Windward and leeward are each drawn half as often, as surveys rarely know. ISO, Juerges, McAdams, Watmuff
-mean the wind beside the surface, the others the wind that comes up to the building.
+Outside, with the wind v: iso-6946, 4 + 4 v (ISO 6946, annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and
+mcadams, 5.7 + 3.8 v (McAdams 1954), both from one wind tunnel; both contain radiation and free convection, and are
+drawn only if weights name them; watmuff, 2.8 + 3 v, the same without radiation and free convection (Watmuff, Charters
+and Proctor 1977); mowitt, sqrt((0.84 dT^(1/3))^2 + (3.26 v^0.89)^2) windward, with 3.55 v^0.617 leeward (Yazdanian and
+Klems 1994, measured on windows; coefficients by Booten and others 2012, as in EnergyPlus); tarp, `natural_w_m2k` +
+2.537 Rf sqrt(v P/A), leeward with half of the second term (Sparrow and others 1979, Walton 1983), Rf 1.67 for brick,
+P/A 0.5 per metre; emmel, `natural_w_m2k` + 5.15 v^0.81 windward, 3.54 v^0.76 leeward (Emmel, Abadie and Mendes 2007,
+walls; sum as in EnergyPlus). Windward and leeward formulas have half the weight, as surveys rarely know the side. v of
+ISO, Juerges, McAdams, Watmuff is the wind beside the surface, v of the others the wind that comes up to the building.
 Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 dT^0.24 for walls
-without a heater (Khalifa and Marshall 1990), elsewhere as walton; madding, 1.31 dT^(1/3) for all (Madding 2008), drawn
-only if weights name it.
-Simple models, which take all that a surface sees to be as warm as the air: iso-6946-combined, 1 / Rse, and inside 1 /
-Rsi by the direction of the heat flow; albatici-tonelli, 3.8054 v beside radiation to the air (Albatici and Tonelli
-2010); dallo, 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013)."""
+without a heater (Khalifa and Marshall 1990), elsewhere as walton; madding, 1.31 dT^(1/3) for all surfaces (Madding
+2008), drawn only if weights name it.
+Simple models assume that all that a surface sees is as warm as the air: iso-6946-combined, 1 / Rse, and inside 1 / Rsi
+by the direction of the heat flow; albatici-tonelli, 3.8054 v beside radiation to the air (Albatici and Tonelli 2010);
+dallo, 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013)."""
 
 
 def simple_models(side: str) -> tuple[str, ...]:
-    """Return the names of the simple models in `FILMS`: the balance never draws them."""
+    """Return the names of the simple models in `FILMS`, which the balance never draws; `side`: outside or inside."""
     return tuple(name for name, film in FILMS[side].items() if film.radiates != "seen")
 
 
@@ -132,8 +132,8 @@ def surface_temperature_k(
 ) -> Values:
     """Return the temperature of a surface, [K], from a camera's reading of the surface.
 
-    The surface sends eps Ts^4 + (1 - eps) T_surr^4, which the camera takes for eps_set T_read^4 + (1 - eps_set)
-    T_set^4. The law of total radiation stands in for the radiation in the camera's band.
+    The solution of eps Ts^4 + (1 - eps) T_surr^4, radiation from the surface, = eps_set T_read^4 + (1 - eps_set)
+    T_set^4, radiation assumed by the camera. The camera's band is replaced by total radiation (Stefan-Boltzmann).
 
     Args:
         reading_k: Temperature that the camera reads, [K].
@@ -186,7 +186,7 @@ def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArr
 
 
 def view_shares(upward: FloatArray) -> FloatArray:
-    """Return the shares of sky, air near the horizon, and ground in a surface's view, (k, 3); rows add up to 1.
+    """Return the view factors of sky, air near the horizon, and ground from a surface, (k, 3); rows add up to 1.
 
     F_ground = (1 - cos tilt) / 2. Of the rest, a share b = sqrt((1 + cos tilt) / 2) is sky, and 1 - b is air near the
     horizon, about as warm as the air at the ground (EnergyPlus Engineering Reference, "External Longwave Radiation";

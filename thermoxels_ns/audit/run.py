@@ -49,12 +49,12 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.files.vtu import pv
 
 F_RSI_M2K_W = (0.13, 0.25)
-"""Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
+"""Inside surface resistances Rsi of the two temperature factors, [m2 K / W]; for mould ISO 13788 takes the second."""
 _LEAST_FLOW_W_M2 = 1e-9
-_FEW = 2000  # Number of draws that tell by how much a cause widens an interval
+_FEW = 2000  # Number of draws from which is computed by how much each cause widens an interval
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
-"""Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
+"""Limits of EN 13187: least inside minus outside air, largest wind speed, least hours since sun and since wetness."""
 
 _MEANT_AS_EXACT = ("emissivity set in the camera", "reflected temperature set in the camera")
 _NAMES = {
@@ -65,7 +65,7 @@ _NAMES = {
 }
 
 Verdict = Literal["met", "not met", "cannot tell"]
-_NOT_OF_EN_13187 = ("purpose", "certificate", "parts_not_observed")  # Facts of a `Survey` that it does not ask for
+_NOT_OF_EN_13187 = ("purpose", "certificate", "parts_not_observed")  # Fields of `Survey` that EN 13187 does not ask for
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Limit:
     at_most: bool  # True: `found` must not exceed the limit; False: `found` must not fall below the limit
     found: Interval
     verdict: Verdict
-    missed_share: float  # Chance that the limit is not kept, 0 to 1: the share of draws that do not keep it
+    missed_share: float  # Share of the draws that miss the limit, 0 to 1; NaN if `found.value` is NaN
 
 
 @dataclass(frozen=True)
@@ -86,22 +86,22 @@ class Element:
     """Results for one part of the envelope: a patch, or all observed patches together."""
 
     name: str
-    area_m2: float  # Area of the triangles that count
-    area_range_m2: Interval  # The same with what geometry may be off by
-    unobserved_m2: float  # Area of the part's other triangles, without those that the scene box or the region cuts
+    area_m2: float  # Area of the part's triangles that count
+    area_range_m2: Interval  # Interval of `area_m2`: the borders of the reconstructed part are uncertain
+    unobserved_m2: float  # Area of the part's triangles that do not count, without triangles that are cut ("cut")
     surface_c: Interval  # Mean surface temperature, [degrees Celsius]
     loss_w: Interval  # Heat flow from inside to outside, [W]
-    u_w_m2k: Interval
+    u_w_m2k: Interval  # U-value, [W/(m2 K)]; NaN if the air temperature outside is not known
     width_shares: Mapping[str, float]
-    """By cause, largest first, the share by which the interval of the U-value (of the loss, where no U-value is known)
-    would be narrower if the cause were known exactly, 0 to 1; shares need not add up to 1."""
+    """Causes of uncertainty, largest share first. The share, 0 to 1, says how much narrower the interval of the U-value
+    (of `loss_w` if no U-value is known) would be if the cause were known exactly. Shares need not add up to 1."""
     unsupported_share: float  # Share of the area whose position no photograph supports, 0 to 1
-    most_u_w_m2k: float  # U-value that the films of air allow without a wall, see `exchange.most_u_w_m2k`
+    most_u_w_m2k: float  # Largest possible U-value, of the films of air without a wall, see `exchange.most_u_w_m2k`
 
 
 @dataclass(frozen=True)
 class Defect:
-    """Results for one thermal bridge or other defect; "extra" heat flows are in excess of the undisturbed surface's."""
+    """Results for one thermal bridge or other defect; "extra" heat flow is the excess over an undisturbed surface."""
 
     kind: DefectKind
     patch: str
@@ -114,8 +114,8 @@ class Defect:
     undisturbed_c: float  # Mean temperature of the undisturbed surface near by, [degrees Celsius]
     extra_w: Interval  # Extra heat flow from inside to outside, [W]
     coefficient: Interval
-    """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
-    f_rsi: tuple[Interval, ...]  # Temperature factors of the spot for `F_RSI_M2K_W`; empty if seen from outside
+    """`extra_w` per kelvin between the airs; of a line per metre (psi), [W/(m K)], of a point (chi) or area, [W/K]."""
+    f_rsi: tuple[Interval, ...]  # Temperature factors of the place of `spot_c` for `F_RSI_M2K_W`; seen from outside: ()
     not_counted: str  # Sentence that says why the defect does not count; empty if the defect counts
 
 
@@ -125,7 +125,7 @@ class Asked:
 
     what: str
     asked: str
-    stated: str  # Empty if nothing is known
+    stated: str  # What the conditions state; empty if they state nothing
     verdict: Literal["met", "not met", "not stated"]
 
 
@@ -148,9 +148,7 @@ class SurveyCheck:
 
 @dataclass(frozen=True)
 class Audit(HasTables):
-    """All results of one audit, with the conditions and the surface that the results follow from.
-
-    It has the tables "patches", "defects", "limits", "energy" and "savings"."""
+    """All results of one audit, with the conditions and the surface that the results follow from."""
 
     conditions: Conditions
     surface: AuditedSurface
@@ -164,9 +162,9 @@ class Audit(HasTables):
     calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
     budget: Mapping[str, float]
-    """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
-    draws: int  # Number of draws behind each interval
-    remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
+    """By cause, largest first: how much narrower `whole.loss_w` would be if the cause were known exactly, [W]."""
+    draws: int  # Number of random draws behind each interval
+    remembered: Interval | None  # Interval of `remembered_share`; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -174,9 +172,9 @@ class Audit(HasTables):
 
     @property
     def impossible(self) -> tuple[str, ...]:
-        """Sentences on U-values that reach beyond what the films of air allow, and on what to look at: none or one.
+        """One sentence if the U-value interval of a patch reaches above `Element.most_u_w_m2k`; else none.
 
-        The sentence names the two inputs that widen the U-value's interval most: one of them clashes with the readings.
+        The sentence names the two inputs that widen the U-value of `whole` most: one of them contradicts the readings.
         """
         over = [one for one in self.patches if one.u_w_m2k.high > one.most_u_w_m2k]
         if not over:
@@ -197,7 +195,7 @@ class Audit(HasTables):
         return f"Audit({told}, U {u.value:.3g} W/(m2 K) ({u.low:.3g} to {u.high:.3g}), {defects} defects)"
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the results by patch, defect and limit; an interval has columns of its own for both ends."""
+        """Return the tables of results; an interval has the columns NAME (its value), NAME_low and NAME_high."""
         year = self.energy
         return {
             "patches": lines_of((*self.patches, self.whole)),
@@ -208,7 +206,7 @@ class Audit(HasTables):
         }
 
     def to_pyvista(self) -> pv.PolyData:
-        """Return the boundary, as `vtu.boundary_surface`, with the results of each triangle; NaN: does not count."""
+        """Return `vtu.boundary_surface` with a cell array per result (NaN: does not count); defects count from 1."""
         data, calibration = boundary_surface(self.surface.mesh), self.calibration
         numbers = np.zeros(len(self.surface.mesh.facets), dtype=np.int32)
         for number, one in enumerate(self.found, start=1):
@@ -228,11 +226,11 @@ class Audit(HasTables):
 def audit_mesh(
     mesh: AnyMesh, conditions: Conditions | Mapping[str, Any] | Path | str, *, up: Sequence[float] | None = None
 ) -> Audit:
-    """Find heat loss, U-values and thermal bridges, each as an interval, from the temperatures that a mesh holds.
+    """Return heat loss, U-values and thermal bridges, each as an interval, from the temperatures that a mesh holds.
 
-    `mesh` is what `thermoxels_ns.solve` takes, `conditions` a `Conditions`, the path of a yaml file, or its keys as a
-    mapping. `up` points up in the coordinates of the mesh; by default it is what the mesh says, or else z. Raises
-    `AuditError` if the conditions are wrong or do not fit the mesh, `ThermoxelsError` if the mesh is not sound.
+    `mesh` is what `thermoxels_ns.solve` takes. `conditions` is a `Conditions`, the path of a yaml file, or a mapping of
+    the keys of such a file. `up` points up in the coordinates of the mesh; None: as stored with the mesh, or else z.
+    Raises `AuditError` if the conditions are wrong or do not fit the mesh, `ThermoxelsError` if the mesh is not sound.
     """
     if not isinstance(conditions, Conditions):
         conditions = load_conditions(conditions)
@@ -248,10 +246,10 @@ def audit(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     least_bridge_w: float = 0.0,
 ) -> Audit:
-    """Compute heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
+    """Return heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
 
-    `up` is the unit vector that points up. Bridges that lose less than `least_bridge_w` extra, [W], are not counted and
-    not judged. Raises `AuditError` if the conditions do not fit the mesh.
+    `up` is the unit vector that points up. Defects whose extra heat flow is below `least_bridge_w`, [W], do not count
+    and are not judged by limits. Raises `AuditError` if the conditions do not fit the mesh.
     """
     surface = audited_surface(mesh, conditions, up)
     draws = with_references(surface, conditions, draw(conditions))
@@ -293,7 +291,7 @@ def _largest_first(amounts: Mapping[str, float]) -> dict[str, float]:
 
 
 class _Drawn(NamedTuple):
-    """An element with draws of its heat flow, [W], area, [m2], and U-value, [W/(m2 K)], shape (k,) each."""
+    """An element, and its heat flow, [W], area, [m2], and U-value, [W/(m2 K)], in every draw, shape (k,) each."""
 
     element: Element
     flow_w: FloatArray
@@ -302,9 +300,9 @@ class _Drawn(NamedTuple):
 
 
 class _Work:
-    """Heat flow and temperature of elements and defects in every draw.
+    """Heat flow and temperature of all parts of a surface in every draw, and the results that follow.
 
-    The elements are the patches, each with a reading error and an error of its border of its own, and their sum.
+    `parts`: the patches, then zone, reference and spot of each defect, then the coldest spot (from outside: hottest).
     """
 
     def __init__(
@@ -328,7 +326,10 @@ class _Work:
         self.surface_c, self.flow_w = self.parts.in_draws(draws)
 
     def elements(self) -> tuple[list[_Drawn], _Drawn, dict[str, float]]:
-        """Return the patches, all that was observed, and `Audit.budget`."""
+        """Return each patch as an element, their sum as one element, and `Audit.budget`.
+
+        Each patch has a reading error (repeatability) and an error of its border that other patches do not share.
+        """
         surface, conditions, patches, count = self.surface, self.conditions, self.patches, len(self.patches)
         of_facet, members = surface.selection.facet_patch, np.vstack([np.eye(count), np.ones(count)])
         area_m2, slope_w_k = self.parts.area_m2[:count], self.parts.slope_w_k[:count, None]
@@ -337,7 +338,7 @@ class _Work:
         off_by = conditions.camera.repeatability.off_by
 
         def drawn(draws: Draws, flow_w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Return flow, area and U-value of each element, (e, k), from flows of the patches without their errors."""
+            """Return flow, area, U-value of p patches and their sum, (p + 1, k) each; adds own errors to `flow_w`."""
             off_k = np.stack([draws.local(off_by, n) for n in range(count)])
             size = np.stack([1.0 + one * draws.geometry(n) for n, one in enumerate(wider.tolist())])
             flow_w, area = members @ ((flow_w + slope_w_k * off_k) * size), members @ (area_m2[:, None] * size)
@@ -380,13 +381,13 @@ class _Work:
         return found[:-1], found[-1], _largest_first(budget)
 
     def own_error_k(self, number: int) -> FloatArray:
-        """Draw the reading error that a defect, or the coldest spot, does not share with others, shape (k,), [K]."""
+        """Return draws of the reading error of one defect or spot alone, (k,), [K]; each `number` has its own error."""
         return self.draws.local(self.conditions.camera.repeatability.off_by, len(self.patches) + number)
 
     def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[FloatArray, ...]:
-        """Return draws of the temperature factors of a part for `F_RSI_M2K_W`, (k,); empty if seen from outside.
+        """Return draws, (k,), of the temperature factor for each of `F_RSI_M2K_W`; empty if seen from outside.
 
-        `off_k` are draws of the part's own reading error, shape (k,), [K].
+        `part` is a place in `parts`; `off_k` are draws of the reading error of this part alone, shape (k,), [K].
         """
         if self.conditions.side == "outside":
             return ()
@@ -396,11 +397,10 @@ class _Work:
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
 
     def defect(self, number: int, one: FoundDefect, least_w: float) -> tuple[Defect, FloatArray]:
-        """Return the results of defect `number`, with draws of its `Defect.coefficient`.
+        """Return the results of `one`, found defect `number`, and its `Defect.coefficient` in every draw, (k,).
 
-        Extra heat flow is the flow of the zone minus the flow that the undisturbed surface near by would have on the
-        area under the zone (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are of the seen side).
-        `least_w` is the least extra flow that counts, [W].
+        Extra heat flow is that of the zone minus that of undisturbed surface of the area `base_area_m2` (psi = q_tb -
+        q_uniform per metre, O'Grady and others 2017; areas are of the seen side); below `least_w` it does not count.
         """
         surface, zone, off_k = self.surface, len(self.patches) + 3 * number, self.own_error_k(number)
         calm, spot = zone + 1, zone + 2
@@ -441,9 +441,9 @@ def _limits(
     whole: _Drawn,
     f_rsi: tuple[FloatArray, ...],
 ) -> tuple[Limit, ...]:
-    """Judge U-values of patches, the coefficient of the worst linear bridge, heat loss and temperature factors.
+    """Return the verdict on each limit: U-values of patches, psi of the worst line, temperature factor, heat loss.
 
-    Defects come with draws of their coefficients; draws have shape (k,).
+    `defects` are pairs of a defect and its coefficient in every draw, (k,). `f_rsi` are draws, (k,), for `F_RSI_M2K_W`.
     """
     limits, found = conditions.limits, list[Limit]()
 
@@ -471,9 +471,9 @@ def _limits(
 
 
 def _check_film(conditions: Conditions, surface: AuditedSurface, draws: Draws, patches: Sequence[Element]) -> None:
-    """Raise `AuditError` if a simple film model gives a patch a U-value of 0 or less, and the balance one above 0.
+    """Raise `AuditError` if a patch has a U-value up to 0 by a simple film model, but one above 0 by the balance.
 
-    Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
+    Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1, describe nights with this result.
     """
     chosen, balance_works = conditions.film.model, conditions.side == "inside" or conditions.outside.wind is not None
     failing = [one for one in patches if one.u_w_m2k.value <= 0.0]
@@ -491,7 +491,7 @@ def _check_film(conditions: Conditions, surface: AuditedSurface, draws: Draws, p
 
 
 def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tuple[Asked, ...]:
-    """Return what EN 13187 and ISO 6781-3 (certificate) ask of a survey; without conditions, of one from outside."""
+    """Return what EN 13187 and ISO 6781-3 (certificate) ask of a survey; `conditions` None: not yet known, outside."""
     found, wind, difference = list[Asked](), None, None
     if conditions is not None:
         wind = conditions.outside.wind
@@ -517,7 +517,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
+    """Return what EN 13187 and ISO 6781-3 ask of a survey, what makes its results doubtful, and facts not stated."""
     return SurveyCheck(asked_of_survey(conditions.survey, conditions), _doubts(conditions), _missing(conditions))
 
 
@@ -557,7 +557,7 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
 
 
 def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...]]:
-    """Return `Audit.remembered` with sentences on it; raises `AuditError` if the weather file is unfit."""
+    """Return `Audit.remembered` and sentences on it; raises `AuditError` if the weather or the air outside is unfit."""
     weather = conditions.weather
     if weather is None or weather.time_constant is None:
         return None, ()

@@ -1,4 +1,4 @@
-"""Choose the boundary triangles that count, and group triangles so alike that one heat flow holds for each group."""
+"""Choose the boundary triangles that count, and group those so alike that one heat flow is computed for each group."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ chosen_names = partial(names_chosen, error=AuditError)  # `AuditError` if a patt
 
 
 class Readings(NamedTuple):
-    """What the thermal camera read on n pieces of surface: here groups of triangles."""
+    """Readings of the thermal camera on n pieces of surface, which are triangles or groups of triangles."""
 
     reading_c: FloatArray  # Mean reading, not corrected, shape (n,), [degrees Celsius]
     upward: FloatArray  # Upward part of the outward unit normal, shape (n,)
@@ -72,18 +72,18 @@ class AuditedSurface:
 
     @property
     def read(self) -> BoolArray:
-        """True where thermal images measured a triangle that photographs show, left out or not, shape (f,)."""
+        """True where a triangle counts or would count if the conditions did not leave it out, shape (f,)."""
         return self.counted | (self.why_not == list(WHY_NOT).index("left out"))
 
     @property
     def range_c(self) -> tuple[float, float]:
-        """Lowest and highest reading where one was `read`, without stray ones, [degrees Celsius]."""
+        """The 0.5 % and 99.5 % quantiles of the readings of `read` triangles, at least 0.1 K apart, [C]."""
         low, high = np.quantile(self.reading_c[self.read], (0.005, 0.995)).tolist()
         return low, max(high, low + 0.1)
 
     @property
     def rim(self) -> BoolArray:
-        """True where a triangle counts but touches a triangle that is cut, unseen or without a reading, shape (f,)."""
+        """True where a triangle counts but shares a node with one that is cut, unseen or without reading, (f,)."""
         facets = self.mesh.facets
         unknown = np.zeros(len(self.mesh.points_m), dtype=bool)
         unknown[facets[~self.read]] = True
@@ -91,12 +91,11 @@ class AuditedSurface:
 
     @cached_property
     def border_m2(self) -> FloatArray:
-        """By how much each triangle's area may be off because the border of its patch may lie elsewhere, (f,), [m2].
+        """Largest error of each triangle's area because the true border of its patch is uncertain, (f,), [m2].
 
-        Half a triangle's edge, times the length of its sides on the border: pi / 4 of these, as edges zigzag about a
-        line. Twice that where less than three photographs support the triangle. On the drawn house the surface is off
-        by 0.6 and 1.2 edges (root of the mean square) there and there, and its borders by a third of that. 0
-        everywhere on a mesh that was not made of photographs.
+        It is half a triangle's edge times pi / 4 of the length of its sides on the border, which zigzag about a line;
+        twice that where less than three photographs support the triangle; 0 on a mesh not made of photographs. On the
+        drawn house the surface is off by 0.6 edges (root mean square), and 1.2 with less support; borders by a third.
         """
         facets, tags = self.mesh.facets, self.mesh.boundary
         if tags.photographs is None:
@@ -112,8 +111,10 @@ class AuditedSurface:
 
     @cached_property
     def alike(self) -> tuple[Readings, IntArray]:
-        """Groups of triangles that count and share a patch and nearly the same reading and inclination, with their
-        means by area, and the group of each triangle, shape (f,); -1 where it does not count."""
+        """Area-weighted means of groups of triangles, and the group of each triangle, (f,); -1: does not count.
+
+        The triangles of a group have the same patch and nearly the same reading and inclination.
+        """
         which = np.flatnonzero(self.counted)
         area, reading, upward = np.maximum(self.area_m2[which], 1e-300), self.reading_c[which], self.upward[which]
         # All film and sky models depend on the inclination of a normal alone, not on its azimuth.
@@ -128,17 +129,16 @@ class AuditedSurface:
         return Readings(mean_c, mean_upward, self.surface_entry[which[first]]), of_triangle
 
     def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
-        """Return the triangles of `which`, (k,), of largest `amount`, (k,), whose areas just add up to `SPOT_M2`."""
+        """Return the fewest triangles of `which`, (k,), by falling `amount`, (k,), with an area of `SPOT_M2` in all."""
         ranked = which[np.argsort(-amount, kind="stable")]
         return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
 
 
 def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
-    """Find the boundary triangles that count: seen, measured at all three nodes, not cut and not left out.
+    """Return the boundary of a mesh; triangles count if seen, measured at all three nodes, not cut, not left out.
 
-    Raises:
-        AuditError: The conditions name a patch that the mesh does not have, a patch with readings has no emissivity,
-            or no triangle counts.
+    `up` is the unit vector that points up. Raises `AuditError` if the conditions name a patch that the mesh does not
+    have, a patch with readings has no emissivity, or no triangle counts.
     """
     selection, tags = Selection(mesh, up), mesh.boundary
     names = selection.patch_names

@@ -1,4 +1,4 @@
-"""The weather before a survey, and what a wall still remembers of it."""
+"""Read the weather before a survey, and compute how heat that a wall has stored from it changes the heat flow."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _TAKEN = {
     ("surroundings", "sky", "cloud"): ("cloud", ""),
     ("surroundings", "sky", "dew_point"): ("dew_point_c", "C"),
 }
-"""Entries of conditions that may say "weather", with the column and the unit that then stand for them."""
+"""Entries of conditions that may say "weather", with the column and the unit of the value that replaces the word."""
 _OUTER, _WALL, _INNER, _CELLS = 0.04, 1.0, 0.13, 60  # Resistances of films and wall, [m2 K / W]; layers of the wall
 
 
 def survey_weather(
     file: str, date: datetime | None = None, facing_deg: Sequence[float] = ALL_AROUND_DEG
 ) -> dict[str, FloatArray]:
-    """Return hours, 0 at the survey and negative before, and each column of `COLUMNS` that the file has, (k,) each.
+    """Return `hours`, 0 at the survey and negative before, and each column of `COLUMNS` that the file has, (k,) each.
 
-    `date` is that of the survey, which an .epw file needs; `facing_deg`: see `read_weather`. Raises `AuditError` if the
-    file cannot be read or does not reach the survey.
+    `date` is date and time of the survey and must be given for .epw files; `facing_deg`: see `read_weather`. Raises
+    `AuditError` if the file cannot be read, has impossible temperatures, or does not begin before and reach the survey.
     """
     with raising(AuditError, "weather: file: "):
         if date is None and file.lower().endswith(".epw"):
@@ -50,7 +50,7 @@ def survey_weather(
 
 
 def check_airs(file: str, columns: dict[str, FloatArray]) -> None:
-    """Raise `RecordError` if a temperature of a weather file is none of air."""
+    """Raise `RecordError` if a temperature in the columns of a weather file is not within -90 to 70 C."""
     for name, values in columns.items():
         if name.endswith("_c") and not ((values > -90.0) & (values < 70.0)).all():
             got = f"{values.min():g} to {values.max():g} C"
@@ -58,10 +58,11 @@ def check_airs(file: str, columns: dict[str, FloatArray]) -> None:
 
 
 def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return conditions in which each "weather" of `_TAKEN` is the value of the weather file at the survey.
+    """Replace each "weather" of `_TAKEN` in conditions by the weather file's value at the survey; return `content`.
 
-    A file of 24 hours and more also tells extremes of the airs, and how long ago the sun shone, if nothing else does.
-    Names of files are taken from `folder` on.
+    `content` is changed in place. Where it does not state them, the extremes of the airs during the last 24 hours (if
+    the file is that long) and the hours since sun are added. Names of files in `folder` become paths. Raises
+    `AuditError` if the file is unfit or has no such column.
     """
     weather, energy = content.get("weather"), content.get("energy")
     if isinstance(energy, dict) and isinstance(energy.get("climate"), str):
@@ -102,12 +103,13 @@ def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:
 def remembered_share(
     series: dict[str, FloatArray], difference_k: float, time_constant_h: float, absorptance: float, inside: bool
 ) -> float:
-    """Return by what share heat flow through a surface differs from the steady one, because a wall stores heat.
+    """Return (heat flow - steady heat flow) / steady heat flow at a surface of a wall that stores heat, at the survey.
 
-    The wall is uniform, with films of ISO 6946; its slowest mode decays within `time_constant_h`. Its temperature is
-    that of the steady state of each moment minus, for each mode, what has not yet decayed of the changes of the airs
-    (Carslaw and Jaeger 1959, Duhamel's theorem). Before the first line of `series` all was as in that line; sun on the
-    wall, [W/m2], warms its air by absorptance / 25. `difference_k` is that of the airs at the survey, above 0.
+    The wall is uniform, with films of ISO 6946; its slowest mode has the time constant `time_constant_h`. By Duhamel's
+    theorem (Carslaw and Jaeger 1959), its temperature is the steady one minus, for each mode, the part of earlier air
+    changes that has not decayed. `series` is from `survey_weather`; before its first line all was as in that line. Sun,
+    [W/m2], warms the outer air by `absorptance` / 25. The caller must give a `difference_k`, inside minus outside air
+    at the survey, above 0. `inside`: the heat flow is that at the inner surface (True) or at the outer one (False).
     """
     between = np.full(_CELLS - 1, _CELLS / _WALL)
     ends = [1.0 / (film + 0.5 * _WALL / _CELLS) for film in (_OUTER, _INNER)]

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 ANSWERS, PAGE, DOCUMENT, SURFACE = "answers.json", "audit.html", "audit.pdf", "surface.vtp"
 """Files that an audit writes."""
 ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
-"""Files that an audit writes if `Audit.envelope` asks for them."""
+"""File names of the formats of `Audit.envelope`."""
 _PATCHES = {"wall": "tan", "roof": "indianred", "window": "deepskyblue", "door": "saddlebrown", "ground": "yellowgreen"}
 """Colours of proposed patches."""
 
@@ -107,7 +107,10 @@ class Audit:
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
-    """Audit a mesh, write all files, return the result; None if conditions or patches were written instead."""
+    """Audit a mesh, write all files and return the result; None if an option asked for another file instead.
+
+    `say` receives lines of progress. For errors see `Audit.main`.
+    """
     from thermoxels_ns.audit.compare import compare
     from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
     from thermoxels_ns.audit.envelope import envelope_of
@@ -183,7 +186,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
 def write_agreement(path: Path, conditions: Path | None) -> None:
     """Write what a client signs before a survey to a .pdf or .html file, filled in from a file of conditions, if any.
 
-    Raises `AuditError` for other endings, or if WeasyPrint is missing or the conditions are wrong.
+    Raises `AuditError` if `path` exists or ends otherwise, WeasyPrint is missing, or the conditions are wrong.
     """
     from thermoxels_ns.audit.conditions import Survey
     from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml
@@ -205,9 +208,10 @@ def write_agreement(path: Path, conditions: Path | None) -> None:
 
 
 def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: Say) -> None:
-    """Find the flat elements of a building, write them as rules to `path`, and draw them in a PNG file beside it.
+    """Find the flat elements of a building, write them as patch rules to `path`, and draw them in a PNG file beside it.
 
-    Raises `AuditError` if one of the files exists already, `MeshError` if no planes of the mesh enclose a body.
+    `up` and `north` are directions in the coordinates of the mesh. Raises `AuditError` if one of the files exists or
+    `path` itself ends with .png, `MeshError` if no planes of the mesh enclose a body.
     """
     from thermoxels_ns.mesh.boundary.patches import with_patches, write_patch_rules
     from thermoxels_ns.mesh.boundary.planes import find_building, proposed_rules
@@ -248,7 +252,7 @@ def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: S
 
 
 def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[str, Any]]:
-    """Return the mesh with the patches asked for, the unit vector that points up, and the summary of the export."""
+    """Return the mesh `path` with the patches of `Audit.patches`, the unit vector up, and the export's summary.json."""
     from thermoxels_ns.mesh.boundary.patches import load_patch_rules, with_patches
     from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
 
@@ -264,9 +268,9 @@ def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[s
 
 
 def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
-    """Read an earlier audit from its answers.json and the surface.vtp beside it; return a function that repeats it.
+    """Read an earlier audit from its answers.json and the surface.vtp beside it; return a function that audits again.
 
-    Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0.
+    Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0 (None: unused).
     """
     from thermoxels_ns.audit.compare import earlier_conditions
     from thermoxels_ns.audit.run import audit
@@ -323,7 +327,7 @@ def _write(
     envelope: Envelope | None,
     compared: Comparison | None,
 ) -> tuple[str, ...]:
-    """Write all files and return their names."""
+    """Write all files of an audit, answers.json last, and return their names; raises `AuditError` for bad answers."""
     from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml

@@ -1,4 +1,4 @@
-"""Cut photographs and thermal images of defects out of the view that shows each defect largest."""
+"""Cut each defect out of the photograph and the thermal image in which the defect is largest."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from thermoxels_ns.reports.audit_page import MOST_DEFECTS
 from thermoxels_ns.reports.page import Picture, colours, image_file
 
 _MOST_POINTS = 1000  # Most triangles of a defect that are projected into photographs
-_CELLS = 64  # Cells across and along a photograph; in each cell the nearest triangle hides farther ones
+_CELLS = 64  # Number of cells per row and per column of a photograph; the nearest triangle of a cell hides the others
 _HIDDEN = 1.05  # A triangle is hidden if it is this many times as far as the nearest triangle of its cell
 _MARGIN, _LEAST_SHARE = 0.6, 0.3
 """Margin around a defect, as a share of its size, and least width of the cut-out, as a share of the image's width."""
-_BELOW_K, _COLDER = 0.5, 200  # Pixels colder than the range by this are grey, [K], and the grey, 0 to 255
+_BELOW_K, _COLDER = 0.5, 200  # Pixels colder than the range by this much, [K], have this level of grey, 0 to 255
 _WIDTH = 480  # Width of a cut-out, [pixels]
 
 
 def photographs_of_defects(
     scene: SceneFile, metres_per_unit: float, found: Audit
 ) -> dict[int, tuple[Picture, Picture]]:
-    """Cut each defect out of photograph and thermal image that show it largest; return both by place in `found.found`.
+    """Return cut-outs of the photograph and the thermal image that show a defect largest, by place in `found.found`.
 
-    `metres_per_unit` is the length of one unit of the scene's poses, [m]; the colours of thermal images span the range
-    of readings on the surface; what is colder is grey, as sky is. Defects that no photograph shows are left out, and so
-    are defects beyond `MOST_DEFECTS`.
+    `metres_per_unit` is the length of one unit of the scene's poses, [m]. The colours of thermal images span the
+    readings on the surface; colder pixels, such as sky, are grey. Only the first `MOST_DEFECTS` defects are searched;
+    a defect is left out if no photograph shows it, or if the best photograph has no thermal image that shows it.
     """
     frames = scene.frames
     surface = found.surface
@@ -40,7 +40,8 @@ def photographs_of_defects(
     pictures = dict[int, tuple[Picture, Picture]]()
     for number, one in enumerate(found.found[:MOST_DEFECTS]):
         some = one.core[:: max(1, len(one.core) // _MOST_POINTS)]
-        points, normals, area = every[some], surface.selection.facet_normal[some], surface.area_m2[some]
+        points, normals = every[some], surface.selection.facet_normal[some]
+        area = surface.area_m2[some] / metres_per_unit**2
         scores = [_size_in_view(frame, nearest, points, normals, area) for frame, nearest in zip(frames, hidden_behind)]
         if not scores or max(scores) <= 0.0:
             continue
@@ -52,7 +53,7 @@ def photographs_of_defects(
 
 
 def _nearest(frame: Frame, points: FloatArray) -> FloatArray:
-    """Return the distance of the nearest point in each cell, (`_CELLS`, `_CELLS`); infinite in cells without points."""
+    """Return the distance from the camera to the nearest point of each cell, (`_CELLS`, `_CELLS`); inf: no point."""
     pixels, inside, distance = _seen_from(frame, points)
     nearest = np.full((_CELLS, _CELLS), np.inf)
     np.minimum.at(nearest, _cells(frame.intrinsics, pixels[inside]), distance[inside])
@@ -65,7 +66,7 @@ def _cells(camera: Camera, pixels: FloatArray) -> tuple[IntArray, ...]:
 
 
 def _seen_from(frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return the pixels of points, (k, 2), whether each lies in the photograph, (k,), and distances from the camera."""
+    """Return pixels of points, (k, 2), whether each lies in the photograph, (k,), and distances to the camera, (k,)."""
     pixels = frame.intrinsics.project_world(frame.pose, points)
     return pixels, frame.intrinsics.contains(pixels), np.linalg.norm(points - frame.pose[:3, 3], axis=1)
 
@@ -73,7 +74,12 @@ def _seen_from(frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray,
 def _size_in_view(
     frame: Frame, nearest: FloatArray, points: FloatArray, normals: FloatArray, area: FloatArray
 ) -> float:
-    """Return the solid angle, [sr], of the triangles that lie in a photograph, face it, and are not hidden."""
+    """Return the solid angle, [sr], of the k triangles that lie in a photograph, face the camera, and are not hidden.
+
+    `points` are the centroids of the triangles, (k, 3), `normals` their outward unit normals, (k, 3), and `area` their
+    areas, (k,), in squared units of the scene's poses. `nearest` is `_nearest` of all triangles of the mesh: a triangle
+    is hidden if it is more than `_HIDDEN` times as far as the nearest triangle of its cell.
+    """
     pixels, seen, distance = _seen_from(frame, points)
     if not seen.any():
         return 0.0
@@ -86,7 +92,10 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """Cut photograph and thermal image around some points, as JPEG files; None if one is missing or shows no point."""
+    """Return JPEG cut-outs of photograph and thermal image around points, (k, 3); None if one of these shows none.
+
+    `limits` are the temperatures of the darkest and the brightest colour, [degrees Celsius].
+    """
     if frame.thermal is None:
         return None
     temperature_c = read_thermal_file(frame.thermal, scene.unit)
@@ -107,7 +116,7 @@ def _cut_out(
 
 
 def _framed(picture: npt.NDArray[np.uint8], pixels: FloatArray) -> bytes:
-    """Cut a picture around some pixels, (k, 2), and draw a frame around the pixels; return a JPEG file."""
+    """Return a JPEG file of a picture, (h, w, 3), cut out around some pixels, (k, 2), with a frame around them."""
     size = np.array(picture.shape[1::-1], dtype=np.float64)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     half = np.maximum((0.5 + _MARGIN) * (high - low), 0.5 * _LEAST_SHARE * size)

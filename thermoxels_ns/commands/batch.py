@@ -48,9 +48,9 @@ STAGES: Mapping[str, Needs] = {
     "heat": Needs(1, 3000, 120),
     "audit": Needs(1, 3000, 60),
 }
-"""Stages in the order in which they follow. A stage that ran out of memory or was ended is tried once more, and then
-asks for twice the memory and time."""
-AFTER = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}  # What a stage follows
+"""Stages in order. One that ran out of memory, or was ended from outside, is tried again with twice memory and time."""
+AFTER = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}
+"""Stage that must have ended well before each stage begins."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Building:
 
 
 class Stage(NamedTuple):
-    """A stage of one building: its command, and the files that must be there before."""
+    """A stage of one building: its command, and the files that must exist before it begins."""
 
     command: list[str]
     inputs: list[str]
@@ -84,7 +84,7 @@ class Stage(NamedTuple):
 
 @dataclass
 class Batch:
-    """Take many buildings from photographs to a mesh, heat and an audit; goes on past those that fail.
+    """Take many buildings from photographs to a mesh, heat and an audit; one that fails does not stop the others.
 
     The list is a csv file with the columns name, scene or photographs, and, where wanted, patches, heat, conditions,
     train and export (see docs/batch.md). Snakemake runs the stages; the same command goes on where it was interrupted.
@@ -104,7 +104,7 @@ class Batch:
     """Print what would be run, with the resources asked for, and stop."""
 
     def main(self) -> None:
-        """Run all stages, and write the page; raises `ThermoxelsError` if any building is not finished."""
+        """Run all stages and write the page; raises `ThermoxelsError` for a wrong list, or a building not finished."""
         from thermoxels_ns.reports.page import build_page, write_page
 
         say = partial(print, flush=True)
@@ -164,10 +164,9 @@ class Batch:
 
 
 def read_list(path: Path) -> dict[str, Building]:
-    """Return the buildings of a csv file by their names; files are read beside the list.
+    """Return the buildings of a csv file by their names; paths in it are relative to the folder of the file.
 
-    Raises:
-        SceneError: The file cannot be read, has unknown columns, or lines that do not say a building; all are named.
+    Raises `SceneError` with all mistakes if the file cannot be read, or if columns or lines are wrong.
     """
     known = [field.name for field in fields(Building)]
     try:
@@ -226,7 +225,7 @@ def read_batch(folder: Path) -> dict[str, Building]:
 
 
 def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
-    """Return the stages of a building by name, in order; each needs the marker of the one before it."""
+    """Return the stages of a building by name, in order; inputs hold the marker file of the stage in `AFTER`."""
     scene = building.scene or str(folder / "scene")
     config = str(folder / "outputs" / "building" / "thermoxels" / "run" / "config.yml")
     mesh = str(folder / "mesh" / "mesh.vtu")
@@ -263,10 +262,10 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
 
 
 def run_stage(name: str, stage: str, attempt: int) -> int:
-    """Run a stage of a building in the folder of the batch, and return its exit status.
+    """Run a stage of building `name` and return its exit status; the caller must be in the folder of the batch.
 
-    A stage that ended by itself for another reason than memory is not tried a second time: `attempt` 2 then ends as it
-    did. What ends it before its command does leaves the note that it was ended from outside.
+    If attempt 1 failed by itself and not for lack of memory, attempt 2 runs nothing and returns the earlier status. If
+    this process is killed, a note stays that says that the stage was ended from outside.
     """
     folder = writable_folder(Path(name) / "logs").parent
     failed, log = folder / "logs" / f"{stage}.failed.json", folder / "logs" / f"{stage}.log"
@@ -288,7 +287,7 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
 
 
 def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
-    """Return what the page says of a building: how far it came, what it cost, and the main figures of its audit."""
+    """Return what the page says of a building: finished stages, errors, costs, and the main figures of its audit."""
     own, plan = folder / name, plan_of(building, Path(name))
     costs = {stage: cost for stage in plan if (cost := _read(own / f"{stage}.json"))}
     notes = {stage: _read(own / "logs" / f"{stage}.failed.json") for stage in plan if stage not in costs}
@@ -314,7 +313,7 @@ def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the content of a json file; {} if there is none or it is not whole."""
+    """Return the content of a json file; {} if there is no file or its text is not complete json."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -51,7 +51,7 @@ class Capture(CaptureSettings):
 def capture_folder(
     source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
 ) -> CaptureResult:
-    """Turn a folder of camera files into a scene and write its page; raises the errors of `run_capture`."""
+    """Turn a folder of camera files into a scene, and write its page; raises the errors of `run_capture`."""
     from thermoxels_ns.capture.stages import run_capture
     from thermoxels_ns.reports.capture_page import write_capture_page
 

@@ -35,7 +35,7 @@ _RUNS = "cost.json"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
 Row = Mapping[str, Any]
-"""Figures of a run by name, None where there is none, and the command that trains it, `training`."""
+"""Figures of a run by the names of `FIGURES`, None if not measured, and under "training" the command that trains it."""
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Cost:
 
 
 def run_cost(cost: Cost, screen: TextIO) -> None:
-    """Train and evaluate every setting that cost.json does not hold, and write the table to `screen`. See `Cost`."""
+    """Train and evaluate every setting that is not in cost.json, and print the table to `screen`; errors as `Cost`."""
 
     def say(line: str) -> None:
         print(line, file=screen)
@@ -110,7 +110,7 @@ def run_cost(cost: Cost, screen: TextIO) -> None:
 
 
 def training_options(setting: str) -> tuple[str, ...]:
-    """Return the options of ns-train for a setting ``resolution:steps``; raises `ThermoxelsError` for other texts."""
+    """Return ns-train's options for a setting ``resolution:steps`` (voxels, steps); other texts: `ThermoxelsError`."""
     from thermoxels_ns.training.schedule import schedule_for
 
     match = re.fullmatch(r"([1-9]\d*):([1-9]\d*)", setting)
@@ -127,7 +127,7 @@ def training_options(setting: str) -> tuple[str, ...]:
 
 
 def table_of(rows: Mapping[str, Row]) -> list[str]:
-    """Return the lines of a Markdown table of rows by setting; columns that are empty in all rows are left out."""
+    """Return the lines of a Markdown table, one row per setting; columns that are empty in all rows are left out."""
     names = [name for name in FIGURES if any(row[name] is not None for row in rows.values())]
     lines = [" | ".join(["| setting", *(FIGURES[name][0] for name in names)]) + " |", "|---|" + "---:|" * len(names)]
     for setting, row in rows.items():
@@ -137,7 +137,7 @@ def table_of(rows: Mapping[str, Row]) -> list[str]:
 
 
 def cheapest(rows: Mapping[str, Row], target_mae: float) -> str:
-    """Return a sentence on the fastest setting whose thermal MAE is at most the target, [degrees Celsius]."""
+    """Return a sentence that names the fastest setting whose thermal MAE is at most `target_mae`, [degrees Celsius]."""
     wanted = f"a thermal MAE of at most {target_mae:g} °C"
     able = [
         name for name, row in rows.items() if row["thermal_mae_c"] is not None and row["thermal_mae_c"] <= target_mae
@@ -151,7 +151,10 @@ def cheapest(rows: Mapping[str, Row], target_mae: float) -> str:
 def _measure(
     scene: Path, method: str, words: Sequence[str], name: str, folder: Path, screen: TextIO
 ) -> dict[str, float | None]:
-    """Train a setting, evaluate it, remove the model, and return all figures, None where there is none."""
+    """Train with the options `words`, evaluate, delete the model, and return all `FIGURES`; None: not measured.
+
+    Logs go to the subfolder logs of `folder`. Raises `ThermoxelsError` if a command fails.
+    """
     name, logs = re.sub(r"[^0-9A-Za-z.-]+", "-", name), writable_folder(folder / "logs")
     output = logs / f"{name}.json"
     with TemporaryDirectory(dir=folder) as models:

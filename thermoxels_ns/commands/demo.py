@@ -81,10 +81,9 @@ class Demo:
 
 
 def prepare_folder(path: Path) -> Path:
-    """Make the folder of a demo, remove the results of an earlier demo, and return the folder.
+    """Make the folder of a demo, delete the results of an earlier demo in it, and return the folder.
 
-    Only results in a folder that an earlier demo has marked are removed. Raises `OutputError` if the folder holds files
-    but no such mark, or if it cannot be written to.
+    Raises `OutputError` if the folder holds files but not the mark of a demo, or cannot be written to.
     """
     folder = writable_folder(path)
     marker = folder / _MARKER
@@ -103,7 +102,7 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path) -> dict[str, list[str]]:
-    """Return the commands of the demo by what they do, in order."""
+    """Return the commands of the demo in order, by the title of their step."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
     scene, audited, survey = str(folder / "scene"), str(folder / "audit"), folder / "survey"
     export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--patches", str(survey / "patches.yaml")]

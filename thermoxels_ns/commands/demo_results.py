@@ -54,7 +54,7 @@ class Target:
 
 
 def read_results(eval_json: Path, summary_json: Path) -> tuple[Target, ...]:
-    """Return figures of ``ns-eval`` (on held-out views) and of ``ns-export thermoxels-mesh`` with their targets."""
+    """Return figures from the json files of ``ns-eval`` and ``ns-export thermoxels-mesh``, with their targets."""
     image, truth = numbers_of(eval_json, "results"), numbers_of(summary_json, "truth")
     tolerance = truth("tolerance_voxels")
     return (
@@ -74,10 +74,7 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[Target, ...]:
 
 
 def numbers_of(path: Path, name: str) -> Callable[[str], float]:
-    """Return a function that takes a key and returns the number under it in the object `name` of a json file.
-
-    The function returns NaN for null, which stands for a figure that does not exist, for instance without a surface.
-    """
+    """Return a function from a key to its number in the object `name` of a json file, NaN for null (not measured)."""
     content = read_json_object(path, _AGAIN)[name]
     return lambda key: math.nan if content[key] is None else float(content[key])
 
@@ -98,7 +95,7 @@ class Compared:
 
 
 def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
-    """Compare the U-values and psi in an audit's answers.json with the exact house; `rules`: the house's patch file."""
+    """Return U-values and psi of an audit's answers.json beside their true values; `rules`: the house's patch file."""
     content, true = read_json_object(answers, _AGAIN), true_u_of_patches(rules)
     found = [
         Compared(one["name"], "W/(m2 K)", true[one["name"]], Interval(**one["u_w_m2k"])) for one in content["patches"]
@@ -111,7 +108,7 @@ def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
 
 
 def true_u_of_patches(rules: Path) -> dict[str, float]:
-    """Return the mean true U-value of each patch that a file of patches cuts out of the house, [W/(m2 K)]."""
+    """Return the mean true U-value, [W/(m2 K)], of the exact house on each patch of a file of patches, by name."""
     points, normals = house_corner().solid.surface_points(_POINTS)
     every, none = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
     where = {"centroids_m": points, "normals": normals, "up": (0.0, 0.0, 1.0), "seen": every, "on_box": none}
@@ -136,9 +133,9 @@ def demo_page(
     seconds: Sequence[tuple[str, float]],
     commands: Sequence[str],
 ) -> str:
-    """Return the html text of a demo's page; raises `ThermoxelsError` if a picture is missing in the demo's folder.
+    """Return the html text of a demo's page; `seconds` are names and durations of the demo's steps.
 
-    `seconds`: names and durations of steps.
+    Raises `ThermoxelsError` if a picture is missing in `folder`.
     """
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
     photographs = sorted((drawn / "images").glob("frame_train_*"))

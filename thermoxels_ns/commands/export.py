@@ -150,7 +150,7 @@ class ExportThermoxelsMesh(ExportOptions):
 
 
 def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, SceneScale | None]:
-    """Return the rules for the solid, those for patches, and the scale that follows from a known distance, if any.
+    """Return the rules for the solid, the rules for patches, and the scale from `known_distance`; None without one.
 
     Raises `ThermoxelsError` for a wrong option.
     """
@@ -175,7 +175,7 @@ def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, S
 
 
 def prepare_folder(output_dir: Path | str) -> Path:
-    """Make an export's folder, without half-written files; raises `OutputError` if it holds files of others."""
+    """Make and return an export's folder; raises `OutputError` if files there that no export wrote are in the way."""
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
     mark = _SUMMARY if (Path(output_dir) / _SUMMARY).is_file() else _UNFINISHED
@@ -183,7 +183,7 @@ def prepare_folder(output_dir: Path | str) -> Path:
 
 
 def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
-    """Return the mesh of what is solid in a trained scene, see `build_mesh`.
+    """Return the mesh of what is solid in a trained scene, with the support of its surface if `run.dataset` is given.
 
     Raises `ThermoxelsError` if an option is wrong, a scale is needed and not known, or nothing is solid.
     """
@@ -222,12 +222,10 @@ def export_scene(
 ) -> dict[str, Any]:
     """Write mesh files, summary.json and pictures; return the content of summary.json.
 
-    Everything is computed before anything is written. The new summary is named summary-unfinished.json until all files
-    are written, so files beside a summary.json belong together. Files of earlier exports that are not rewritten go.
-    `say` receives lines of progress.
-
-    Raises:
-        ThermoxelsError: An option is wrong, nothing is solid, or a file cannot be written.
+    Mesh and summary are computed before any file is written or deleted. Then files of an earlier export that this one
+    does not write are deleted, the mesh files are written, and last the pictures are rendered. The summary is named
+    summary-unfinished.json until then, so all files beside a summary.json belong to one export. `say` receives lines of
+    progress. Raises `ThermoxelsError` if an option is wrong, nothing is solid, or a file cannot be written.
     """
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_start, write_mesh
 
@@ -284,7 +282,7 @@ def export_scene(
 
 
 def _draw(folder: Path, run: TrainedScene, made: SceneMesh) -> None:
-    """Draw the pictures of a mesh into a folder."""
+    """Write the pictures `_PICTURES` of a mesh into a folder; support.png only if support was computed."""
     from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.reports import mesh_pictures
 
@@ -312,9 +310,9 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
 
 
 def with_support(built: BuiltMesh, depths: Depths, run: TrainedScene, to_mesh: FloatArray) -> BuiltMesh:
-    """Return `built` with the numbers of photographs that see and that support each boundary triangle.
+    """Return `built` with the counts of photographs that see and that support each triangle, `Boundary.photographs`.
 
-    See `facet_views` and `supporting_photographs`. Matrix `to_mesh`, (4, 4), leads from the trained scene to the mesh.
+    `to_mesh`, (4, 4), transforms the trained scene to the mesh. See `facet_views` and `supporting_photographs`.
     """
     from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.mesh.solid.free_space import facet_views
@@ -332,10 +330,7 @@ def with_support(built: BuiltMesh, depths: Depths, run: TrainedScene, to_mesh: F
 
 
 def _against_truth(run: TrainedScene, made: SceneMesh, say: Say) -> dict[str, Any] | None:
-    """Compare solid voxels and mesh with the exact scene; None if the scale or an exact scene is not known.
-
-    If the comparison fails, its error is returned in its place.
-    """
+    """Return figures of solid and mesh against the exact scene, or its "error"; None: scale or scene not known."""
     from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
 
     if made.scale is None:
@@ -378,12 +373,11 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
 def viewpoint_of_cameras(
     camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike
 ) -> tuple[tuple[float, float, float], str, tuple[float, float, float] | None]:
-    """Choose `up`, `up_source` and `view_direction` of a `TrainedScene`.
+    """Return `up`, `up_source` and `view_direction` of a `TrainedScene`, computed from its cameras.
 
-    Up is as the photographer held the camera, and pictures are seen from the side where the cameras stood.
-
-    Poses are in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
-    around, `view_direction` is None, which means obliquely from above.
+    Up assumes that the photographer held the camera level. Pictures are seen from the side where the cameras stood; if
+    they stood all around, `view_direction` is None. `camera_to_worlds` are poses in the trained scene (camera axes: x
+    right, y up, z back), (n, 3, 4) or (n, 4, 4); `world_to_input` is that of `TrainedScene`.
     """
     from thermoxels_ns.capture.sfm.scale_and_up import find_up
 
@@ -405,7 +399,10 @@ def viewpoint_of_cameras(
 def lines_on_mesh(
     built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
 ) -> Iterator[str]:
-    """Yield lines on each step to the solid, and on the mesh; `region` is `region_summary`, lengths are in `unit`."""
+    """Yield lines on each step that made the solid, and on the mesh.
+
+    `region` is a `region_summary`; `volume` (of the mesh) and `voxel_size` are in `unit`.
+    """
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):
@@ -483,7 +480,7 @@ def mesh_summary(built: BuiltMesh, figures: MeshFigures, scale: SceneScale | Non
 
 
 def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
-    """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
+    """Return the entry "region" of summary.json: extents of the mesh, voxels taken and left out, share of the solid."""
     points, left_out = built.mesh.points_m, int(built.solid.left_out.sum())
     # Solid voxels in the whole lattice, before regions are left out and interiors are filled.
     found = sum(step.added for step in built.solid.steps if step.name in ("threshold", "close gaps"))
@@ -497,7 +494,7 @@ def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
 
 
 def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
-    """Return the sum of `amount`, (k,), over entries with equal `number`, (k,), by name; unused names are left out."""
+    """Return the sum of `amount`, (k,), by name; `number`, (k,), are places in `names`; unused names are left out."""
     total = np.bincount(number, weights=amount, minlength=len(names))
     return {names[n]: float(total[n]) for n in np.unique(number)}
 

@@ -98,7 +98,7 @@ class Heat:
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
-    """Compute a heat run, write all of its files and return it; answers.json marks a complete folder, so comes last."""
+    """Compute a heat run, write its files, and return it; answers.json is written last, as it marks complete files."""
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
     names, series = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY), f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
@@ -109,7 +109,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
 
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
-    """Read mesh and scene, `HeatError` if one is missing, and compute the heat run, without writing files."""
+    """Read mesh and scene, compute the heat run and return it without writing files; errors: see `Heat.main`."""
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
@@ -143,8 +143,8 @@ def resistances_of_audit(path: Path, say: Say = lambda _: None) -> dict[str, flo
     """Return the resistance from the air inside to the outer surface by patch, [m2 K / W], from an answers.json.
 
     R = (Ti - Ts) A / Q with the temperatures Ti of the air inside and Ts of the surface, the area A and the heat flow Q
-    that the audit found: the air outside is left out, because the scene has its own. Patches whose heat flow is no more
-    than a bound are named in a line and left out. Raises `HeatError` for other files and for audits from inside.
+    that the audit found. The film outside is no part of R, as the scene has one. A patch whose interval of Q reaches
+    down to 0 is left out. Raises `HeatError` for other files, for audits from inside, and if no patch is left.
     """
     content, remedy = read_json_object(path, "Pass the answers.json of thermoxels audit.", HeatError), "Audit again."
     try:
@@ -212,7 +212,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
 
 
 def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
-    """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
+    """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if that fails."""
     from thermoxels_ns.fem.solution import SteadySolution
     from thermoxels_ns.mesh.files.vtu import body_grid, write_vtk
     from thermoxels_ns.reports.heat_page import heat_page
@@ -246,7 +246,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
 
 
 def _write_series(path: Path, run: HeatRun) -> None:
-    """Write a csv line for each time: temperatures, and mean heat flows since the time before."""
+    """Write a csv file with a line for each time: temperatures, and mean heat flows since the time before it."""
     lines = run.tables()["times"]
     with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -255,7 +255,7 @@ def _write_series(path: Path, run: HeatRun) -> None:
 
 
 def shown_states(times_s: FloatArray, wanted_s: Literal["all"] | tuple[float, ...]) -> list[int]:
-    """Return which kept times go into a series: the first, the last, and the nearest to each of `wanted_s`; or all.
+    """Return places in `times_s` of the times to write: the first, the last, and the nearest to each of `wanted_s`.
 
     >>> shown_states(np.array([0.0, 60.0, 120.0, 180.0]), (70.0,))
     [0, 1, 3]
@@ -267,8 +267,8 @@ def shown_states(times_s: FloatArray, wanted_s: Literal["all"] | tuple[float, ..
 def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: list[int]) -> None:
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
-    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are numbers of
-    kept times. An earlier series is removed first. Raises `OutputError` if writing fails.
+    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are places in
+    `solution.times_s`. An earlier series is deleted first. Raises `OutputError` if writing fails.
     """
     from xml.etree import ElementTree
 
@@ -289,7 +289,7 @@ def write_heat_series(pvd: Path, mesh: TetMesh, solution: HeatSolution, states: 
 
 
 def remove_heat_series(pvd: Path) -> None:
-    """Remove a series that `write_heat_series` wrote, if there is one; raise `OutputError` if a file stays."""
+    """Delete a series that `write_heat_series` wrote, if there is one; `OutputError` if a file cannot be deleted."""
     folder = pvd.with_suffix("")
     for path in (pvd, *folder.glob(STEP_PATTERN)):
         remove_file(path)

@@ -53,7 +53,7 @@ class CommandFailed(ThermoxelsError):
 def command_of(name: str, options: Any) -> str:
     """Return ``thermoxels NAME`` with options as typed in a shell; `options` is a dataclass such as `Heat`.
 
-    The first field is positional, so its name is not written; options at their default are left out.
+    The first field is taken as the positional argument. Options that have their default are left out.
     """
     words = ["thermoxels", name, str(getattr(options, fields(options)[0].name))]
     for field in fields(options)[1:]:
@@ -67,8 +67,8 @@ def command_of(name: str, options: Any) -> str:
 def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -> ProcessCost:
     """Run a command of this installation, write its output to the file `log`, and return its time and memory.
 
-    The folder of `log` must exist. `screen` gets the output as it comes. Raises `ThermoxelsError` if the command
-    fails or does not exist.
+    The folder of `log` must exist. `screen` gets the output while the command runs. Raises `CommandFailed` if the
+    command fails, `ThermoxelsError` if it does not exist.
     """
     folder = Path(sys.executable).parent
     program = shutil.which(words[0], path=str(folder))

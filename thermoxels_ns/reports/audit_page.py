@@ -27,15 +27,14 @@ from thermoxels_ns.reports.numbers import interval_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, gradient, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
-"""PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
-temperature is stated), "misfit" (measured minus computed temperature)."""
+"""PNG files by quantity, a list with one file for each view: "temperature" with the numbers of defects, "u_value" (heat
+flow if no outside temperature is stated), "misfit" (measured minus computed temperature; empty without calibration)."""
 
 MOST_DEFECTS = 12  # Number of defects that get a section of their own
-MOST_TRIANGLES = 100_000
-"""Most triangles of a view; on more, nodes are put together, first where nothing counts."""
+MOST_TRIANGLES = 100_000  # Most triangles of the 3-D view, see `thinned`
 
-_COARSER = 4.0  # Nodes at which nothing counts are put together in cells this many times as large
-_BEFORE_SURFACE_M = 0.4  # Distance of the marks of bridges from the surface, [m]; nearer, it hides half of them
+_COARSER = 4.0  # Nodes at which no triangle counts are merged in cells this many times as large as the others'
+_BEFORE_SURFACE_M = 0.4  # Distance of the marks of bridges from the surface, [m]; if nearer, half of them are hidden
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
 
 
@@ -50,12 +49,11 @@ def audit_page(
     compared: Comparison | None = None,
     paper: bool = False,
 ) -> str:
-    """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
+    """Return the html text of an audit's page; it has a 3-D view unless `pictures` is None or `paper` is True.
 
-    It has a 3-D view if it has pictures and is not meant for `paper`.
-
-    `photographs` are pictures of defects by place in `audit.defects`; without `pictures` the page has no drawings.
-    `compared` is what changed since an earlier survey.
+    `pictures` are those of `draw_audit`; None: the page has no drawings. `photographs` are pictures of defects by place
+    in `audit.defects`, `command` is the command that made the audit, `files` are names of files beside the page, and
+    `compared` is the comparison with an earlier survey, if any.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -107,10 +105,7 @@ def gbxml(envelope: Envelope, title: str) -> str:
 
 
 def draw_audit(audit: Audit) -> AuditPictures:
-    """Draw all pictures: triangles from one or two sides, grey where they have no value.
-
-    In a view from inside, cut and unseen triangles are left out.
-    """
+    """Return all pictures of the triangles of `drawn_triangles`, seen from one or two sides; grey: does not count."""
     from thermoxels_ns.reports.mesh_pictures import image_of_surface
 
     surface, mesh, known = audit.surface, audit.surface.mesh, audit.conditions.outside_known
@@ -166,7 +161,7 @@ def _views(audit: Audit) -> list[FloatArray]:
 
 @cache
 def plotly_script() -> str:
-    """Return plotly.js as `packed` text: 2 MB of 4.8 (its wheel holds no smaller one that draws in 3-D)."""
+    """Return plotly.js as `packed` text of 2 MB; plotly's wheel holds no smaller script that draws in 3-D."""
     from plotly.offline import get_plotlyjs
 
     return packed(get_plotlyjs())
@@ -178,10 +173,7 @@ def packed(text: str) -> str:
 
 
 def view_data(audit: Audit, toward: FloatArray) -> str:
-    """Return what the view shows, `packed`: triangles with values and patches, marks of bridges, where to look from.
-
-    `toward` is the direction, (3,), in which the view looks at first.
-    """
+    """Return the json text of the 3-D view, `packed`; `toward`, (3,), is the direction in which it looks at first."""
     from plotly.colors import get_colorscale
 
     surface, known = audit.surface, audit.conditions.outside_known
@@ -227,7 +219,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
 
 
 def drawn_triangles(audit: Audit) -> BoolArray:
-    """Return which boundary triangles pictures show, (f,): in a view from inside, none that are cut or unseen."""
+    """Return True for the boundary triangles that pictures show, (f,): from inside, none that are cut or unseen."""
     if audit.conditions.side == "outside":
         return np.ones(len(audit.surface.why_not), dtype=bool)
     kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
@@ -245,10 +237,10 @@ def numbered_defects(audit: Audit) -> Iterator[tuple[int, Defect, FloatArray]]:
 def thinned(
     points_m: FloatArray, facets: IntArray, counted: BoolArray, most: int
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return points, (m, 3), and at most `most` of the triangles `facets`, (f, 3), with their places in `facets`, (g,).
+    """Return points, (m, 3), triangles, (g, 3), g at most `most`, and the place of each in `facets`, (g,).
 
-    If there are more, points that share a cell of a grid become their mean; triangles left without area go. The grid is
-    as coarse as it must be, and finer by `_COARSER` at triangles that count, whose values are theirs, not means.
+    If there are more `facets`, (f, 3), points in one cell of a grid are replaced by their mean, and triangles with two
+    equal corners are deleted. Cells are as small as possible, and smaller by `_COARSER` at triangles that count.
     """
     used, corners = np.unique(facets, return_inverse=True)
     points, corners, which = points_m[used], corners.reshape(facets.shape), np.arange(len(facets))

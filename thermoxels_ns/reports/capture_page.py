@@ -57,9 +57,9 @@ def write_capture_page(result: CaptureResult) -> None:
 def thermal_in_photograph(
     frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = 640
 ) -> Float32Array:
-    """Return the temperature that a thermal image, [degrees Celsius], shows at each pixel of a reduced photograph.
+    """Return a thermal image, [degrees Celsius], warped to a reduced photograph, (height, `width`); NaN beyond it.
 
-    The shape is (height, `width`), NaN beyond the thermal image. Depths come from the scene points that `frame` sees.
+    `visible` is the camera of the full photograph. Depths are interpolated between the scene points that `frame` sees.
     """
     height = max(1, round(visible.height * width / visible.width))
     rays = _grid_rays(visible, width, height)
@@ -87,7 +87,7 @@ def _grid_rays(camera: Camera, width: int, height: int) -> FloatArray:
 
 
 def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate) -> npt.NDArray:
-    """Draw a thermal image in colours over its photograph in grey, with edges in white, shape (height, width, 3)."""
+    """Return a thermal image in colours over its photograph in grey, with white edges, shape (height, width, 3)."""
     carried = thermal_in_photograph(frame, temperature_c, visible, rig)
     height, width = carried.shape
     photograph = read_photograph(frame).astype(np.uint8)

@@ -62,18 +62,16 @@ def image_of_surface(
     ghost: tuple[FloatArray, IntArray] | None = None,
     window_size: tuple[int, int] = (1200, 900),
 ) -> npt.NDArray[np.uint8]:
-    """Draw a whole surface, coloured by values at its nodes, in parallel projection.
+    """Return a picture of a surface coloured by values, in parallel projection, shape (height, width, 3).
 
     Args:
         points_m: Nodes, shape (n, 3).
         facets: Triangles of the surface, shape (f, 3).
         values: Values of nodes, shape (n,), or of triangles, (f,), such as temperatures [degrees Celsius].
         title: Text above the picture.
-        clim: Values at the ends of the colour bar. If left out, the lowest and highest value; but if a few nodes
-            stretch this range to more than twice the range of the middle 99 % of the nodes, the colours span the middle
-            99 %, and a line below the picture gives the lowest and highest value.
+        clim: Values at the ends of the colour bar; None: those of `colour_range`, whose note is written below.
         up: Direction that points up in the picture.
-        view_direction: Direction from the camera to the surface; obliquely from above if left out.
+        view_direction: Direction from the camera to the surface; None: obliquely from above.
         painted: Groups of triangles that show one colour instead of values: a description, the colour, and a boolean
             for each triangle, shape (f,). A line below the picture explains the colours.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
@@ -82,9 +80,6 @@ def image_of_surface(
         labels: Short texts and the points where the texts stand, in front of everything else.
         ghost: Points (n, 3) and triangles (m, 3) of a second surface, drawn in transparent grey.
         window_size: Width and height, [pixels].
-
-    Returns:
-        The picture, shape (height, width, 3).
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. If triton (torch's compiler) is loaded
     # after Mesa, the program ends in a segmentation fault; if triton is loaded first, both work.
@@ -161,7 +156,7 @@ def image_of_mesh(
 ) -> npt.NDArray[np.uint8]:
     """Draw the boundary of a mesh, shape (height, width, 3), with the size of the mesh and `note` written below.
 
-    `values`, shape (n,), are the mesh's temperatures if left out; `look` are arguments of `image_of_surface`.
+    `values`, (n,), are values of nodes; None: temperatures. `look` are arguments of `image_of_surface`.
     """
     shown = mesh.temperature_c if values is None else values
     if values is None and not mesh.has_temperatures and "painted" not in look:
@@ -175,10 +170,10 @@ def _size_of(mesh: TetMesh, length_unit: str) -> str:
 
 
 def colour_range(values: npt.NDArray[np.floating]) -> tuple[tuple[float, float], str]:
-    """Return the values at both ends of a colour bar, and a note for below the picture.
+    """Return the values at both ends of a colour bar, and a note to be written below the picture.
 
-    They are the least and the largest value, and the note is empty. If a few values stretch this range to more than
-    twice that of the middle 99 %, they are the ends of the middle 99 %, and the note gives the least and the largest.
+    The ends are the least and the largest value, and the note is empty. But if the range of all values is more than
+    twice the range of the middle 99 %, the ends are those of the middle 99 %, and the note gives least and largest.
     """
     least, low, high, largest = np.quantile(values, (0.0, 0.005, 0.995, 1.0)).tolist()
     if largest - least > 2.0 * (high - low) > 0.0:
@@ -224,10 +219,10 @@ def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_came
 def draw_surface(
     folder: Path, mesh: TetMesh, states_c: FloatArray, times_s: FloatArray, up: tuple[float, float, float]
 ) -> None:
-    """Draw the pictures `HEAT_PICTURES` of the last state of a heat run into a folder.
+    """Write the pictures `HEAT_PICTURES` of the last state of a heat run into a folder.
 
     Colours of the surface span the part that photographs show, because the inside of a heated building is far warmer.
-    States are nodal temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s].
+    `states_c` are nodal temperatures, shape (s, n), at `times_s`, shape (s,).
     """
     seen = (mesh.facet_tags != FACET_BOX) & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
@@ -251,8 +246,8 @@ def cut_open(
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Cut a body by an upright plane through its middle, and remove the half in front of the plane.
 
-    Returns nodes (n, 3), triangles (f, 3) and nodal values (n,) of the surface of the other half, and a direction from
-    the camera to the cut, shape (3,).
+    Returns nodes (n, 3), triangles (f, 3) and nodal temperatures (n,) of the surface of the half that is kept, and a
+    direction from the camera to the cut, shape (3,). `nodal_c` are temperatures of the mesh's nodes.
     """
     import pyvista as pv
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter

@@ -45,7 +45,7 @@ class Report:
 
 
 def identify(files: Sequence[Path], *choices: object) -> Report:
-    """Return the number of a report that is made of files, those of them that exist, and of choices of its user."""
+    """Return the report number that follows from the contents of those `files` that exist, `choices` and version."""
     with plain_os_errors(files[0], "a file that can be read", "Check its permissions.", ThermoxelsError):
         inputs = tuple((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file())
     digest = hashlib.sha256(repr((__version__, inputs, choices)).encode()).hexdigest()[:12].upper()
@@ -99,7 +99,7 @@ def why_no_pdf() -> str:
 def write_pdf(path: Path, page: str) -> None:
     """Print the html text of a page into a PDF file, whole or not at all.
 
-    Nothing is fetched: pictures lie in the page. Raises `ThermoxelsError` if `why_no_pdf` has a reason.
+    The page must contain its pictures. Raises `ThermoxelsError` if WeasyPrint cannot be used, see `why_no_pdf`.
     """
     lacking = why_no_pdf()
     if lacking:
@@ -111,13 +111,16 @@ def write_pdf(path: Path, page: str) -> None:
 
 
 def gradient() -> str:
-    """Return the colours of `colours`, from dark to bright, as a list for a style sheet."""
+    """Return the colours that `colours` uses, from dark to bright, as a list for a CSS gradient."""
     shown = colours(np.linspace(0.0, 1.0, 17)[None], (0.0, 1.0))[0]
     return ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in shown.tolist())
 
 
 def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
-    """Return colours, (h, w, 3), of temperatures, (h, w), from `limits` (default: `PERCENTILES`); black where NaN."""
+    """Return colours, (h, w, 3), of temperatures, (h, w), black where NaN.
+
+    `limits` are the temperatures of the darkest and of the brightest colour; None: the `PERCENTILES`.
+    """
     import cv2
 
     known = np.isfinite(temperature_c)
