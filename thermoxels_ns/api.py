@@ -81,9 +81,8 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
         run: Folder of the training, such as ``outputs/house/thermoxels/2026-01-31_120000``, or the config.yml in it.
         metres_per_unit: Length of one unit of the input poses, [m]. Default: that in the scene's json, if there is one.
 
-    Raises:
-        CheckpointError: There is no such run, its checkpoint is missing or damaged, or another method trained it.
-        SceneError: The photographs that it was trained on cannot be read.
+    Raises `CheckpointError` if there is no such run, its checkpoint is missing or damaged, or another method trained
+    it; `SceneError` if its photographs cannot be read.
     """
     from threadpoolctl import threadpool_limits
 
@@ -120,8 +119,8 @@ def to_pyvista(mesh: AnyMesh, *, up: Sequence[float] | None = None) -> pv.MultiB
     """Return any mesh that `solve` takes as two blocks, "body" and "boundary"; `Scene.mesh` describes them.
 
     A grid without a boundary gets one with the patches exterior-up, -side and -down and, around closed cavities,
-    interior-up, -side and -down, by the direction `up`; None: as stored with the mesh, or else z. To name patches, set
-    the cell array `patch` of the block "boundary" to names. Raises `ThermoxelsError` if the mesh is not sound.
+    interior-up, -side and -down, by the direction `up`, z by default. To name patches yourself, set the cell array
+    `patch` of the block "boundary" to names. Raises `ThermoxelsError` if the mesh is not sound.
     """
     from thermoxels_ns.mesh.files.vtu import any_mesh, blocks_of
 
@@ -137,7 +136,9 @@ def solve(
     say: Callable[[str], None] = lambda _: None,
     **goals: Any,
 ) -> HeatRun:
-    """Return the heat flows and temperatures of a mesh in a heat scene, as ``thermoxels heat`` computes them.
+    """Return the `HeatRun` of a mesh in a heat scene, as ``thermoxels heat`` computes it.
+
+    It has `results`, `wall` (U-value, f_Rsi), `warnings` and more, `to_frame()` and `to_pyvista()`.
 
     Args:
         mesh: A mesh of `Scene.mesh` or `to_pyvista`; a pyvista UnstructuredGrid of tetrahedra with a point array
@@ -148,9 +149,6 @@ def solve(
         probes_m: Points whose temperature is followed, shape (p, 3), [m].
         say: Function that receives lines of progress, such as `print`.
         **goals: Errors and memory allowed, such as ``tolerance_k=0.05``; see `thermoxels_ns.heat.solving.Goals`.
-
-    Returns:
-        The `HeatRun`: `results`, `wall` (U-value, f_Rsi), `warnings` and more; `to_frame()` and `to_pyvista()`.
 
     Raises:
         HeatError: The scene is wrong or does not fit the mesh, the solver failed, or a tolerance cannot be met.

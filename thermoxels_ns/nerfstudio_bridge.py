@@ -61,7 +61,7 @@ def allow_checkpoint_globals() -> None:
     """Allow ``torch.load(weights_only=True)`` to read the numpy scalars in nerfstudio's checkpoints.
 
     Learning-rate schedulers save numpy scalars beside the tensors, and torch refuses all types not registered as safe.
-    Registered are the function that rebuilds a scalar, `np.dtype` and the dtype classes of plain numbers.
+    This registers the function that rebuilds a scalar, `np.dtype` and the dtype classes of plain numbers.
     """
     # This is numpy.core.multiarray.scalar in numpy 1 and numpy._core.multiarray.scalar in numpy 2.
     rebuild_scalar: Any = np.float64(0).__reduce__()[0]
@@ -70,11 +70,10 @@ def allow_checkpoint_globals() -> None:
 
 
 def extend_commands() -> None:
-    """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands look for all parts of a run at the start.
+    """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands check first that a run's files exist.
 
     nerfstudio's scripts call ``tyro.cli`` when they start. In each script (export, train, eval, render, viewer) that is
-    loaded, as a module or as ``__main__``, the name `tyro` is bound to a copy of tyro whose `cli` is our `_cli`.
-    Scripts that are loaded later are not changed.
+    loaded now, as a module or as ``__main__``, `tyro` is replaced by a copy whose `cli` is our `_cli`.
     """
     main = sys.modules.get("__main__")
     for name in (_EXPORTER, _TRAIN, *_EVALUATIONS):

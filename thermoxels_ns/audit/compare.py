@@ -178,7 +178,10 @@ def _elements(surface: AuditedSurface, shared: BoolArray) -> tuple[dict[str, Int
 
 
 def _flows(audit: Audit, draws: Draws, surface: AuditedSurface, parts: list[IntArray]) -> tuple[FloatArray, FloatArray]:
-    """Return draws of flows per kelvin through parts of `surface`, and their own reading errors, (p, k), [W/K]."""
+    """Return draws of the flow per kelvin through each part, and of its error by a reading error of the part alone.
+
+    Shapes are (p, k), [W/K]. `draws` are those of the survey before contact temperatures correct the camera offset.
+    """
     conditions, draws = audit.conditions, with_references(audit.surface, audit.conditions, draws)
     found = Parts(conditions, surface, draws, parts)
     off_k = np.stack([draws.local(conditions.camera.repeatability.off_by, n) for n in range(len(parts))])

@@ -59,11 +59,8 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
     `background_c` passes the same test: this finds defects weaker than slow changes over a wall. At least one triangle
     of a defect departs by twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
 
-    Args:
-        surface: The audited surface.
-        surface_c: Corrected temperature of each triangle, shape (f,), [degrees Celsius].
-        warm: True: search for warmer triangles (seen from outside); False: for colder ones (seen from inside).
-        least_k: Smallest departure that counts, [K].
+    `surface_c` is the corrected temperature of each triangle, shape (f,), [degrees Celsius]. `warm`: search for warmer
+    triangles (True: seen from outside) or for colder ones (False: seen from inside).
     """
     sure = surface.counted & ~surface.rim
     sign = 1.0 if warm else -1.0
@@ -235,7 +232,7 @@ class _Zones:
         near = others[np.unique(np.concatenate(beside.query_ball_point(self.at[core], 2.0 * reach)).astype(np.int64))]
         calm, top = (float(np.average(surface.reading_c[n], weights=surface.area_m2[n])) for n in (reference, spot))
         step = np.sign(top - calm) * (surface.reading_c[near] - calm)
-        # Half for a patch that departs the other way: on the drawn house what is an error there stays below a tenth.
+        # Half for a patch that departs the other way: on the drawn house errors there are below a tenth of the step.
         return abs(top - calm) <= _OWN_SHARE * float(np.maximum(step, -0.5 * step).max(initial=0.0))
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
@@ -262,8 +259,11 @@ class _Zones:
         return found
 
     def _calm(self, same: IntArray, near: BoolArray, distance: FloatArray, reach: float) -> IntArray:
-        """Return the undisturbed triangles around the zone `near`; if their area is under half the zone's, all of the
-        patch outside the zone; if there are none, the patch outside the zone. For arguments see `_nearest`."""
+        """Return undisturbed triangles of the patch in a ring around the zone `near` (arguments as in `_nearest`).
+
+        If their area is below half of the zone's, the ring becomes the whole patch outside the zone. If no triangle
+        there is undisturbed, all of them are returned.
+        """
         calm = ~near & ~self.departs[same]
         ring = calm & (distance <= 2.0 * reach + 0.5)
         wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
@@ -311,7 +311,10 @@ class _Zones:
 
 
 def _kind(footprint: FloatArray, area_m2: FloatArray, width_m: float, edge_m: float) -> tuple[DefectKind, float]:
-    """Return the kind of a defect and its length, [m]; `footprint`: centroids of its triangles in a plane, (k, 2)."""
+    """Return the kind of a defect and its length, [m] (the largest extent, or area over width of a bent line).
+
+    `footprint` are the centroids of the core's triangles in the plane of the surface, (k, 2), [m].
+    """
     centred = footprint - np.average(footprint, axis=0, weights=area_m2)
     _, axes = np.linalg.eigh((centred * area_m2[:, None]).T @ centred)
     along = centred @ axes[:, ::-1]

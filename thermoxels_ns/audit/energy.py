@@ -29,7 +29,7 @@ _OF_ENERGY = 10**6 + 1  # First argument `number` of `Draws.local`, larger than 
 
 @dataclass(frozen=True)
 class EnergyUse:
-    """Heat through a part of the envelope in a year, with its cost and carbon dioxide; of a measure, what it saves."""
+    """Heat through a part of the envelope in a year, or heat that a measure saves, with its cost and carbon dioxide."""
 
     name: str
     heat_kwh: Interval
@@ -53,8 +53,8 @@ def year_of(
 ) -> EnergyResult | None:
     """Return heat, cost and carbon dioxide of a year, heat = U area degree hours; None if there is no `energy`.
 
-    `elements` are name, area, [m2], and U-value, [W/(m2 K)], of each patch, (k,) each. A draw has the same climate,
-    price and U-values before and after measures. Raises `AuditError` if the climate or a measure's patches are unfit.
+    `elements` are name, area, [m2], and U-value, [W/(m2 K)], of each patch, (k,) each. In a draw, all patches have one
+    climate and one price, before and after measures. Raises `AuditError` if climate or patches of a measure are unfit.
     """
     asked = conditions.energy
     if asked is None:

@@ -101,9 +101,9 @@ class Parts:
         ]
 
     def in_draws(self, draws: Draws, first: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return mean surface temperatures, [C], and heat flows from inside to outside, [W], (p, k) each.
+        """Return mean surface temperature, [C], and heat flow from inside to outside, [W], of parts, (p, k) each.
 
-        If the number `first` is given, only that many parts are computed.
+        `first` is the number of parts to compute, from the first on; None: all.
         """
         rows = self._rows[:first]
         surface_c, flow_w = (np.repeat(off[:first], draws.count, axis=1) for off in self._off)

@@ -34,7 +34,7 @@ def net_radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k4: V
 
 
 def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
-    """Return the coefficient of natural convection, [W/(m2 K)], of a surface `warmer_k` warmer than the air.
+    """Return the coefficient of natural convection, [W/(m2 K)], of a surface `warmer_k` (dT) warmer than the air.
 
     9.482 |dT|^(1/3) / (7.238 - |u|) where warm air rises from the surface or cold air sinks from it, and 1.810
     |dT|^(1/3) / (1.382 + |u|) elsewhere; both are 1.31 |dT|^(1/3) for walls (Walton 1983, TARP; EnergyPlus Engineering
@@ -72,7 +72,7 @@ _COMBINED = {direction: 1.0 / resistance for direction, resistance in INSIDE_RES
 
 
 def _by_direction(w_m2k: Mapping[Any, float]) -> Callable[[Values, Values, Values], Values]:
-    """Return a formula for rooms that depends on the heat flow's direction: a surface facing down has flow "up"."""
+    """Return a formula that takes `w_m2k` by the direction of a room's heat flow: "up" for surfaces facing down."""
     return lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [w_m2k["up"], w_m2k["down"]], w_m2k["horizontal"])
 
 
@@ -132,8 +132,8 @@ def surface_temperature_k(
 ) -> Values:
     """Return the temperature of a surface, [K], from a camera's reading of the surface.
 
-    The solution of eps Ts^4 + (1 - eps) T_surr^4, radiation from the surface, = eps_set T_read^4 + (1 - eps_set)
-    T_set^4, radiation assumed by the camera. The camera's band is replaced by total radiation (Stefan-Boltzmann).
+    Ts solves eps Ts^4 + (1 - eps) T_surr^4 = eps_set T_read^4 + (1 - eps_set) T_set^4: the radiation from the surface
+    equals that which the camera assumes. Total radiation stands in for the radiation in the camera's band.
 
     Args:
         reading_k: Temperature that the camera reads, [K].
@@ -160,10 +160,7 @@ def reading_k(
 
 
 def temperature_factor(resistance_to_outside_m2k_w: Values, inside_resistance_m2k_w: float) -> Values:
-    """Return the temperature factor of an inner surface, f_Rsi = R / (R + Rsi) (ISO 13788).
-
-    R = (Ts - Te) / q, `resistance_to_outside_m2k_w`, is the resistance between the surface and the air outside.
-    """
+    """Return f_Rsi = R / (R + Rsi) (ISO 13788); R = (Ts - Te) / q is the resistance from surface to outside air."""
     return resistance_to_outside_m2k_w / (resistance_to_outside_m2k_w + inside_resistance_m2k_w)
 
 
@@ -171,11 +168,8 @@ def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArr
     """Return the emissivity of a sky that radiates at the temperature of the air at the ground.
 
     eps_sky = (0.787 + 0.764 ln(T_dp / 273)) (1 + 0.0224 N - 0.0035 N^2 + 0.00028 N^3), T_dp in kelvin, N in tenths
-    (EnergyPlus Engineering Reference, "Sky Radiation Modeling"; Clark and Allen 1978, Walton 1983).
-
-    Args:
-        dew_point_c: Dew point of the air, [degrees Celsius].
-        cloud: Share of the sky that clouds cover, 0 to 1.
+    (EnergyPlus Engineering Reference, "Sky Radiation Modeling"; Clark and Allen 1978, Walton 1983). `dew_point_c` is
+    that of the outside air; `cloud` is the share of the sky that clouds cover, 0 to 1.
 
     >>> round(float(sky_emissivity(283.0 - 273.15, 0.0)), 4)
     0.8145

@@ -206,7 +206,10 @@ class Audit(HasTables):
         }
 
     def to_pyvista(self) -> pv.PolyData:
-        """Return `vtu.boundary_surface` with a cell array per result (NaN: does not count); defects count from 1."""
+        """Return `vtu.boundary_surface` with a cell array of each result; NaN: the triangle does not count.
+
+        The array `defect` is the place in `defects`, from 1, of the defect to whose core a triangle belongs; 0: none.
+        """
         data, calibration = boundary_surface(self.surface.mesh), self.calibration
         numbers = np.zeros(len(self.surface.mesh.facets), dtype=np.int32)
         for number, one in enumerate(self.found, start=1):
@@ -491,7 +494,10 @@ def _check_film(conditions: Conditions, surface: AuditedSurface, draws: Draws, p
 
 
 def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tuple[Asked, ...]:
-    """Return what EN 13187 and ISO 6781-3 (certificate) ask of a survey; `conditions` None: not yet known, outside."""
+    """Return the conditions that EN 13187 and ISO 6781-3 (certificate) ask a survey to meet, with verdicts.
+
+    `conditions` is None before a survey: it is then taken as one from outside, and airs and wind as not stated.
+    """
     found, wind, difference = list[Asked](), None, None
     if conditions is not None:
         wind = conditions.outside.wind
@@ -517,7 +523,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Return what EN 13187 and ISO 6781-3 ask of a survey, what makes its results doubtful, and facts not stated."""
+    """Return `asked_of_survey`, sentences on what makes results doubtful, and names of facts that are not stated."""
     return SurveyCheck(asked_of_survey(conditions.survey, conditions), _doubts(conditions), _missing(conditions))
 
 

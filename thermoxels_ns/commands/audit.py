@@ -42,7 +42,7 @@ ANSWERS, PAGE, DOCUMENT, SURFACE = "answers.json", "audit.html", "audit.pdf", "s
 ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
 """File names of the formats of `Audit.envelope`."""
 _PATCHES = {"wall": "tan", "roof": "indianred", "window": "deepskyblue", "door": "saddlebrown", "ground": "yellowgreen"}
-"""Colours of proposed patches."""
+"""Colours of proposed patches by the first word of their names."""
 
 Say = Callable[[str], None]
 

@@ -49,8 +49,7 @@ STAGES: Mapping[str, Needs] = {
     "audit": Needs(1, 3000, 60),
 }
 """Stages in order. One that ran out of memory, or was ended from outside, is tried again with twice memory and time."""
-AFTER = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}
-"""Stage that must have ended well before each stage begins."""
+AFTER = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}  # Stage needed before
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Batch:
     """Take many buildings from photographs to a mesh, heat and an audit; one that fails does not stop the others.
 
     The list is a csv file with the columns name, scene or photographs, and, where wanted, patches, heat, conditions,
-    train and export (see docs/batch.md). Snakemake runs the stages; the same command goes on where it was interrupted.
+    train and export (see docs/batch.md). Snakemake runs the stages; if interrupted, the same command continues them.
     """
 
     list: tyro.conf.Positional[Path]
@@ -265,7 +264,7 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     """Run a stage of building `name` and return its exit status; the caller must be in the folder of the batch.
 
     If attempt 1 failed by itself and not for lack of memory, attempt 2 runs nothing and returns the earlier status. If
-    this process is killed, a note stays that says that the stage was ended from outside.
+    this process is killed, STAGE.failed.json is left behind, which says that the stage was ended from outside.
     """
     folder = writable_folder(Path(name) / "logs").parent
     failed, log = folder / "logs" / f"{stage}.failed.json", folder / "logs" / f"{stage}.log"

@@ -43,7 +43,7 @@ class Cost:
     """Train a scene at several settings and say what accuracy costs: a table of seconds and memory against errors of
     image, temperature and, for drawn scenes, surface.
 
-    Finished runs are kept in cost.json in the output folder, so that an interrupted command goes on where it stopped;
+    Finished runs are kept in cost.json in the output folder, so that an interrupted command continues where it stopped;
     remove the file to measure again. The machine should do nothing else, and have trained once before."""
 
     scene: tyro.conf.Positional[Path]
@@ -66,7 +66,7 @@ class Cost:
 
 
 def run_cost(cost: Cost, screen: TextIO) -> None:
-    """Train and evaluate every setting that is not in cost.json, and print the table to `screen`; errors as `Cost`."""
+    """Train and evaluate each setting that cost.json lacks, and print the table to `screen`; errors: `Cost.main`."""
 
     def say(line: str) -> None:
         print(line, file=screen)

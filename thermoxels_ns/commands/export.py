@@ -49,7 +49,7 @@ _PICTURES = ("mesh.png", "mesh-measured.png", "region.png", "support.png")
 
 @dataclass
 class ExportOptions:
-    """All options of an export that do not name files or folders of its input and output."""
+    """All options of an export, except the files and folders of its input and output."""
 
     boundary: Literal["conforming", "voxel"] = "conforming"
     """conforming: the boundary follows the level set of the density. voxel: the boundary follows voxel faces, as in the
@@ -60,7 +60,7 @@ class ExportOptions:
     training rays that end on a surface meet within half a voxel of their end."""
     density_percentile: float | None = None
     """Voxels are solid if they are denser than this share of all voxels of the scene box, [%], 0 to 100; in the
-    Thermoxels paper 90 keeps the densest tenth. --density-threshold goes before it."""
+    Thermoxels paper 90 keeps the densest tenth. --density-threshold takes precedence over it."""
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide, which thin walls need to be continuous. 0: none."""
     region: Literal["auto", "all"] = "auto"

@@ -95,7 +95,7 @@ def gbxml(envelope: Envelope, title: str) -> str:
     """Return a building of one space as gbXML 6.01; intervals of U-values are in descriptions of constructions."""
 
     def rectangle(one: FlatElement) -> tuple[list[float], float, float]:
-        """Return the corner, [m], the width and the height of the rectangle around an element."""
+        """Return the corner, the width and the height, [m], of the rectangle around an element in its plane."""
         low, high = np.array(one.flat().bounds).reshape(2, 2)
         corner = plane_axes(one.normal) @ low + (one.outline_m[0] @ one.normal) * one.normal
         return corner.tolist(), *(high - low).tolist()
@@ -143,7 +143,7 @@ def draw_audit(audit: Audit) -> AuditPictures:
 
 
 def _views(audit: Audit) -> list[FloatArray]:
-    """Return directions to look in: one towards the seen side, or two from corners if all sides were seen."""
+    """Return viewing directions, (3,) each: one towards the seen side, or two from corners if all sides were seen."""
     surface, up = audit.surface, np.array(audit.surface.selection.up)
     area = surface.area_m2 * surface.counted
     mean = area @ surface.selection.facet_normal / area.sum()
@@ -168,7 +168,7 @@ def plotly_script() -> str:
 
 
 def packed(text: str) -> str:
-    """Return a text compressed with gzip and written in base64; equal texts give equal ones."""
+    """Return a text compressed with gzip and encoded in base64; equal texts give equal results."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
@@ -227,7 +227,7 @@ def drawn_triangles(audit: Audit) -> BoolArray:
 
 
 def numbered_defects(audit: Audit) -> Iterator[tuple[int, Defect, FloatArray]]:
-    """Yield number, defect and mean outward unit normal, (3,), of each defect that counts."""
+    """Yield the number (from 1), the defect and its mean outward unit normal, (3,), for each defect that counts."""
     for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
         if not one.not_counted:
             normal = audit.surface.area_m2[found.core] @ audit.surface.selection.facet_normal[found.core]

@@ -55,7 +55,7 @@ def heat_page(
 
 
 def _values(effect: Effect) -> str:
-    """Return the quantities of an effect as text with units, without quantities at their default."""
+    """Return the quantities of an effect as text with units; quantities that have their default are left out."""
     shown = []
     for field in fields(effect)[1:]:  # type: ignore[arg-type]
         value, unit = getattr(effect, field.name), unit_of(field.name) or "1"
@@ -68,7 +68,7 @@ def _values(effect: Effect) -> str:
 
 
 def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
-    """Return charts of temperatures and, below, of each effect's heat flow over time, as an svg element.
+    """Return charts of temperatures over time and, below, of each effect's heat flow, as one svg element.
 
     `mean_c` is the mean of the volume, shape (s + 1,); `probes_c` has shape (s + 1, p); both are in [degrees Celsius].
     Heat flows are means over the intervals between the s + 1 times.

@@ -244,7 +244,7 @@ def draw_surface(
 def cut_open(
     mesh: TetMesh, nodal_c: FloatArray, up: tuple[float, float, float]
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Cut a body by an upright plane through its middle, and remove the half in front of the plane.
+    """Cut a body by a vertical plane through its middle, and remove the half in front of the plane.
 
     Returns nodes (n, 3), triangles (f, 3) and nodal temperatures (n,) of the surface of the half that is kept, and a
     direction from the camera to the cut, shape (3,). `nodal_c` are temperatures of the mesh's nodes.

@@ -53,10 +53,7 @@ def identify(files: Sequence[Path], *choices: object) -> Report:
 
 
 def build_page(template: str, **shown: Any) -> str:
-    """Return the html text of a page, made from a file in the folder ``templates`` and the values of its variables.
-
-    Equal arguments give equal text.
-    """
+    """Return a page's html text from a file in ``templates`` and its variables `shown`; equal ones give equal text."""
     return _environment().get_template(template).render(**shown)
 
 
