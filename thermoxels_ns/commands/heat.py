@@ -239,7 +239,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     mesh, scene = options.mesh, options.scene
     assert mesh is not None and scene is not None
     inputs = [mesh, mesh.with_name(f"{mesh.stem}-boundary.vtp"), Path(scene), *filter(None, [options.from_audit])]
-    report = identify(inputs, scene, options.probes, options.up, options.tolerance, options.flow_tolerance)
+    goals = options.tolerance, options.flow_tolerance, options.leave_out_below, options.memory_gb, options.allow_unmet
+    report = identify(inputs, scene, options.probes, options.up, *goals)
     write_page(folder / PAGE, heat_page(run, drawn, mesh.name, command_of("heat", options), files, report))
     write_json(folder / ANSWERS, answers)
     say(f"Written to {folder}: {', '.join(files)}")
