@@ -1,4 +1,4 @@
-"""Forms: convection, radiation, fluxes, sources and fixed temperatures as vectors and matrices of the nodes."""
+"""Forms: load vectors and matrices of convection, radiation, fluxes and sources, and fixed temperatures of nodes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from thermoxels_ns.fem.space import Space, sums_by_number
 Vector = FloatArray
 
 COLDEST_SLOPE_K = 1e-2
-"""Lowest temperature for which the slope of radiation is evaluated, so that no Newton matrix is singular, [K]."""
+"""Lowest absolute temperature at which the slope of radiation is evaluated, so that no Newton matrix is singular."""
 _SAME_TEMPERATURE_K = 1e-9  # Two effects may fix the same node if their temperatures differ by no more than this, [K]
-_KEPT_TIMES = 4  # Number of times whose values `at_time` keeps, enough for the stages of a step
+_KEPT_TIMES = 4  # Number of times whose values `at_time` keeps; it is enough for the stages of a step
 
 T = TypeVar("T")
 
 
 def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], most: int = _KEPT_TIMES) -> T:
-    """Return the value at a time from `kept`, or compute and keep it; beyond `most` values the oldest is dropped."""
+    """Return `compute(time_s)`, from the cache `kept` if it is there; the cache holds the last `most` values."""
     if time_s not in kept:
         value = compute(time_s)
         while len(kept) >= most:
@@ -39,17 +39,18 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
 
 
 class _Boundary(ABC):
-    """The k boundary triangles on which an effect acts, and integrals over the triangles.
+    """The k boundary triangles on which an effect acts, and integrals over these triangles.
 
-    Temperatures are relative to a reference, so that round-off is relative to their differences. Every form returns
-    heat flows per triangle, evaluated as in the equations, so that balances close to round-off.
+    The arguments `relative_k` are temperatures of all unknowns, (n,), [K], minus the reference `reference_c`, so that
+    round-off is relative to differences. Heat flows of triangles are evaluated like the load, so that balances close.
+    The number q of integration points per triangle is 3 (the nodes) with linear tetrahedra.
     """
 
     def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:
         self.effect, self.kind, self.parts, self._reference_c = label, effect.form, parts, reference_c
         self.quantities = effect.quantities
         self.load_in_time = any(map(in_time, self.quantities))
-        """True if the heat flow changes with time even while the body's temperatures stay constant."""
+        """True if the heat flow changes with time at constant temperatures of the body."""
         self.nodes = space.facet_nodes(parts)
         self._numbers, self._space = self.nodes.T.ravel(), space
         self._shapes, self._area_m2 = space.facet_rule(parts)
@@ -63,18 +64,19 @@ class _Boundary(ABC):
         return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
-        """Return temperatures at the q points of integration per triangle, (k, q), from those of all nodes, (n,)."""
+        """Return the temperatures at the integration points, minus the reference, shape (k, q), [K]."""
         nodal = relative_k[self.nodes]
         return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
-        """Return integral(q phi_i) for each node i, shape (n,), [W]; the flux q has shape (k, q) or (k, 1)."""
+        """Return the load vector integral(f phi_i), shape (n,), [W], of a flux f of shape (k, q) or (k, 1)."""
         heat_w = flux_w_m2 * self._area_m2
         shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
-        """Return integral(h phi_i phi_j), (n, n), [W / K], for h of shape (k, q) or (k, 1); lumped if `order` is 1."""
+        """Return the boundary matrix integral(h phi_i phi_j), (n, n), [W / K], for h of shape (k, q) or (k, 1). It is
+        lumped, thus diagonal, for linear tetrahedra."""
         if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
@@ -87,7 +89,7 @@ class _Boundary(ABC):
 
     @abstractmethod
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flux into the body, [W / m2], at the points of integration (k, q), or per triangle (k, 1)."""
+        """Return the heat flux into the body, [W / m2], at the integration points (k, q), or per triangle (k, 1)."""
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat flow into the body through each triangle, shape (k,), [W]."""
@@ -95,19 +97,19 @@ class _Boundary(ABC):
 
 
 class _Exchange(_Boundary):
-    """Exchange of heat with surroundings: quantity 0 is its strength, quantity 1 the temperature of surroundings."""
+    """Exchange of heat with surroundings. Entry 1 of `Effect.quantities` is the temperature of the surroundings."""
 
     def strength(self, time_s: float) -> Vector:
-        """Return convection's h, [W / (m2 K)], or radiation's sigma eps, [W / (m2 K4)], per triangle, shape (k, 1)."""
+        """Return convection's h, [W / (m2 K)], per triangle, shape (k, 1); radiation returns sigma eps instead."""
         return self.at(0, time_s)
 
     def surroundings_k(self, time_s: float) -> Vector:
-        """Return the temperature of the surroundings per triangle, relative to the reference, shape (k, 1), [K]."""
+        """Return the temperature of the surroundings per triangle, minus the reference, shape (k, 1), [K]."""
         return self.at(1, time_s) - self._reference_c
 
 
 class ConvectionForm(_Exchange):
-    """Convection or ground contact, flux h (T_ambient - T): a matrix and a load (a Robin boundary condition)."""
+    """Convection or ground contact, a Robin boundary condition with the flux h (T_ambient - T): a matrix and a load."""
 
     @property
     def matrix_in_time(self) -> bool:
@@ -115,32 +117,32 @@ class ConvectionForm(_Exchange):
         return in_time(self.quantities[0])
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
-        """Return integral(h phi_i phi_j), shape (n, n), [W / K]: heat that nodes lose per kelvin."""
+        """Return the Robin boundary matrix integral(h phi_i phi_j), (n, n), [W / K]; lumped for linear tetrahedra."""
         return self.matrix(self.strength(time_s))
 
     def load(self, time_s: float) -> Vector:
-        """Return integral(h T_ambient phi_i), T_ambient being relative to the reference, shape (n,), [W]."""
+        """Return the load integral(h T_ambient phi_i), shape (n,), [W], with T_ambient minus the reference."""
         return self.vector(self.strength(time_s) * self.surroundings_k(time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the flux into the body, h (T_ambient - T), at the points of integration, shape (k, q), [W / m2]."""
+        """Return the flux into the body, h (T_ambient - T), at the integration points, shape (k, q), [W / m2]."""
         return self.strength(time_s) * (self.surroundings_k(time_s) - self.surface_k(relative_k))
 
 
 class FluxForm(_Boundary):
-    """A given heat flux q into the body, the product of the effect's quantities: a load."""
+    """A given heat flux f into the body, the product of the effect's quantities: a load."""
 
     def load(self, time_s: float) -> Vector:
-        """Return integral(q phi_i) for each node i, shape (n,), [W]."""
+        """Return the load integral(f phi_i), shape (n,), [W]."""
         return self.vector(self.flux_w_m2(np.zeros(0), time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the flux into the body, shape (k, 1), [W / m2]; `relative_k` has no influence."""
+        """Return the flux f into the body, shape (k, 1), [W / m2]; `relative_k` has no influence."""
         return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
 
 
 class SourceForm:
-    """A given heat source s in tetrahedra, [W / m3]: a load."""
+    """A given heat source s, [W / m3], in k tetrahedra: a load."""
 
     def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, _: float) -> None:
         self.effect, self.kind, self.parts, self._space = label, effect.form, parts, space
@@ -149,23 +151,23 @@ class SourceForm:
         self.load_in_time = in_time(self._source)
 
     def load(self, time_s: float) -> Vector:
-        """Return integral(s phi_i) for each node i, shape (n,), [W]."""
+        """Return the load integral(s phi_i), shape (n,), [W]."""
         return self._space.source_load(self.parts, self._point_w(time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free in each tetrahedron, shape (k,), [W]; `relative_k` has no influence."""
+        """Return the heat released in each tetrahedron, shape (k,), [W]; `relative_k` has no influence."""
         return self._point_w(time_s).reshape(len(self.parts), -1).sum(axis=1)
 
     def _point_w(self, time_s: float) -> Vector:
-        """Return the heat set free at each of the `Space.source_points`, [W]."""
+        """Return the heat released at each of the `Space.source_points`, shape (k q,), [W]."""
         return values_at(self._source, self._places, time_s) * self._volumes
 
 
 class RadiationForm(_Exchange):
-    """Radiation, flux sigma eps (T_s^4 - T^4) into the body: a load that depends on the temperature, and its slope.
+    """Radiation with the flux sigma eps (T_s^4 - T^4) into the body, T in kelvin: a nonlinear load, and its slope.
 
-    Temperatures below absolute zero, which occur only within a solver's iterations, count as |T|^3 T instead of T^4.
-    The law is then monotone everywhere, the equations are those of a convex minimum, and their solution is unique.
+    Within a solver's iterations, temperatures may fall below absolute zero; |T|^3 T then replaces T^4. The law is thus
+    monotone everywhere, the equations describe the minimum of a convex function, and their solution is unique.
     """
 
     def strength(self, time_s: float) -> Vector:
@@ -173,16 +175,17 @@ class RadiationForm(_Exchange):
         return self.at(2, time_s) * self.at(0, time_s)
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return integral(sigma eps (T_s^4 - T^4) phi_i) for each node i, shape (n,), [W]."""
+        """Return the load integral(sigma eps (T_s^4 - T^4) phi_i), shape (n,), [W]."""
         return self.vector(self.flux_w_m2(relative_k, time_s))
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
-        """Return minus the derivative of the load, integral(4 sigma eps T^3 phi_i phi_j), shape (n, n), [W / K]."""
+        """Return minus the Jacobian of the load, integral(4 sigma eps |T|^3 phi_i phi_j), shape (n, n), [W / K]. T is
+        absolute, `relative_k` is relative to the reference. The matrix is lumped for linear tetrahedra."""
         kelvin = self.surface_k(relative_k) + self._reference_c + ZERO_CELSIUS_K
         return self.matrix(4.0 * self.strength(time_s) * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K) ** 3)
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the flux into the body, sigma eps (T_s^4 - T^4), at points of integration, shape (k, q), [W / m2]."""
+        """Return the flux into the body, sigma eps (T_s^4 - T^4), at the integration points, (k, q), [W / m2]."""
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
         t, s = (kelvin + self._reference_c + ZERO_CELSIUS_K for kelvin in (surface, around))
         # s^4 - t^4 = (s - t) (s + t) (s^2 + t^2): no digits are lost where both are close.
@@ -192,25 +195,25 @@ class RadiationForm(_Exchange):
 
 
 class FixedForm:
-    """Given temperatures of the nodes of k boundary triangles; these nodes are no unknowns."""
+    """Given temperatures of the nodes of k boundary triangles (a Dirichlet condition)."""
 
     def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:
         self.effect, self.kind, self.parts, self.reference_c = label, effect.form, parts, reference_c
         self.owners: IntArray = space.facet_nodes(parts)
-        """Nodes of each triangle, shape (k, m)."""
+        """Nodes of each triangle, shape (k, m): m is 3, or 6 with quadratic tetrahedra."""
         self.nodes = np.unique(self.owners)
         points_m, self._temperature = space.points_m[self.nodes], effect.quantities[0]
         self._places = Places(points_m, np.zeros_like(points_m), space.selection.up)
         self.area_m2: Vector = space.selection.facet_area_m2[parts]
-        """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
+        """Area of each triangle, shape (k,), [m2]; triangles share a node's heat in proportion to it."""
 
     def surroundings_k(self, time_s: float) -> Vector:
-        """Return the given temperatures of `nodes`, relative to the reference, shape (len(nodes),), [K]."""
+        """Return the given temperatures of `nodes` minus the reference, shape (len(nodes),), [K]."""
         return values_at(self._temperature, self._places, time_s) - self.reference_c
 
 
 class FixedNodes:
-    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles."""
+    """All d nodes whose temperature any effect fixes, and the shares of triangles in their heat."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
         self._forms = tuple(forms)
@@ -221,7 +224,8 @@ class FixedNodes:
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
-        """Share of each fixed node's heat (column) that each triangle (row) gets by its area, effect after effect."""
+        """Share of each triangle (row, effect after effect) in the heat of each fixed node (column), (triangles, d).
+        Triangles that fix a node share its heat in proportion to their areas; columns sum to 1."""
         if not self._forms:
             return sparse.csr_matrix((0, 0))
         owners = np.concatenate([form.owners for form in self._forms])
@@ -239,7 +243,7 @@ class FixedNodes:
         return np.flatnonzero(free)
 
     def temperature_k(self, time_s: float) -> Vector:
-        """Return the temperatures of `nodes`, relative to the reference, (d,), [K]; `HeatError` if effects disagree."""
+        """Return the temperatures of `nodes` minus the reference, (d,), [K]; raise `HeatError` if effects disagree."""
         return at_time(self._kept, time_s, self._temperature_k)
 
     def _temperature_k(self, time_s: float) -> Vector:
@@ -276,8 +280,8 @@ _FORMS: dict[str, type[Form]] = {
 def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> tuple[Form, ...]:
     """Return the forms of a problem's effects, sorted by kind: convection, fluxes, sources, radiation, fixed nodes.
 
-    An effect that acts on no triangle or tetrahedron gets no form. Temperatures are relative to `reference_c`. Raises
-    `HeatError` if the mesh lacks a patch or region of an effect.
+    Effects that act on no triangle or tetrahedron are left out. Forms take and give temperatures minus `reference_c`,
+    [degrees Celsius]. Raises `HeatError` if the mesh lacks a patch or region of an effect.
     """
     named = zip(effect_labels(problem), problem.effects)
     acting = [(label, effect, effect.parts(space.selection)) for label, effect in named]

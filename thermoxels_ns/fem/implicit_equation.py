@@ -20,32 +20,31 @@ from thermoxels_ns.fem.system import HeatSystem
 Vector = FloatArray
 
 MOST_UNBALANCED = 1e-3
-"""Largest unbalanced heat of a converged solution, round-off included, as a share of the heat flow through the body: a
-tenth of the uncertainty that the geometry of a reconstruction leaves."""
+"""Largest unbalanced heat of a converged solution, round-off included, as a share of the heat flow through the body. It
+is a tenth of the uncertainty that the geometry of a reconstruction leaves."""
 _BALANCED, _BALANCED_OVER_TOLERANCE = 1e-9, 1e3
-"""Newton's method ends at an unbalanced share of the first, or of the second times the linear tolerance if larger."""
+"""Newton's method ends if the unbalanced share is at most the larger of the first and the second * linear tolerance."""
 MAX_ITERATIONS, MOST_CORRECTIONS = 60, 6
-"""Most steps of Newton's method before the solver gives up: the first with radiation, the second without."""
-_NEWTON_TOLERANCE = 1e-6
-"""Relative tolerance of the linear solver in a Newton step with radiation: the next step corrects the error left."""
+"""Largest number of Newton steps before the solver gives up: the first with radiation, the second without."""
+_NEWTON_TOLERANCE = 1e-6  # Relative tolerance of the linear solver in a Newton step; the next step corrects the rest
 _SAFE = 0.1
 """Largest change in a Newton step, as a share of the absolute temperature, at which a full step is taken without a line
 search: the slope of radiation, 4 sigma eps T^3, then changes by no more than a third."""
 _SETTLED = 1e-5
-"""Largest change in a Newton step, as a share of the absolute temperature, after which the method may end: the error
-left is about the square of this share."""
-_SHORT_OF_LEAST = 0.1  # Relative error of the length that the line search finds
+"""Largest change in a Newton step, as a share of the absolute temperature, after which the method may end. The error
+that is left is about the square of this share."""
+_SHORT_OF_LEAST = 0.1  # Relative error of the step length that the line search finds
 _EPS = float(np.finfo(np.float64).eps)
-_ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
+_ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of absolute values
 PATIENCE = 1500
-"""Most iterations with the diagonal as preconditioner; multigrid then continues from the same x. Multigrid is slow to
-set up, but its number of iterations hardly grows with the mesh, with flat cells or with contrasts."""
-PATIENCE_WHEN_REPEATED = 800  # Iterations in one solve above which the next solves begin with multigrid
-MOST_ITERATIONS = 300  # Most iterations with multigrid, which takes 15 to 50 where it helps
+"""Largest number of iterations with the diagonal as preconditioner; multigrid then continues from the same x. Multigrid
+is slow to set up, but its number of iterations hardly depends on the mesh size, flat cells or contrasts."""
+PATIENCE_WHEN_REPEATED = 800  # Later solves begin with multigrid if a solve took more iterations than this
+MOST_ITERATIONS = 300  # Largest number of iterations with multigrid, which takes 15 to 50 if it helps
 LAST_ITERATIONS = 20_000
-"""Most iterations with the diagonal after multigrid failed: on quadratic tetrahedra 100 times as long as high multigrid
-stalls and the diagonal does not."""
-_PER_UNKNOWN = 10  # Most of these last iterations per unknown: without round-off one would be enough
+"""Largest number of iterations with the diagonal after multigrid failed. On quadratic tetrahedra 100 times as long as
+high, multigrid stalls and the diagonal does not."""
+_PER_UNKNOWN = 10  # Largest number of these last iterations per unknown; without round-off one would be enough
 
 
 @dataclass(frozen=True)
@@ -61,12 +60,12 @@ class LinearSolution:
 class LinearSolver:
     """Solver for A x = b with one symmetric positive definite matrix A and many right-hand sides b.
 
-    Conjugate gradients solve the system of D^-1/2 A D^-1/2, D being the diagonal of A, until the norm of its residual
-    is at most `relative_tolerance` times that of D^-1/2 b. The scaling keeps large cells from outweighing small ones.
+    Conjugate gradients solve the system of D^-1/2 A D^-1/2 with the diagonal D of A, until the residual's norm is at
+    most `relative_tolerance` times the norm of D^-1/2 b. Without this scaling large cells would outweigh small ones.
     """
 
     def __init__(self, matrix: sparse.csr_matrix, *, relative_tolerance: float = 1e-12) -> None:
-        """Scale `matrix`, A; raises `HeatError` if an entry is not finite or a diagonal entry is not above 0."""
+        """Scale `matrix`, A; raise `HeatError` if an entry is not finite or a diagonal entry is not above 0."""
         diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(diagonal > 0)):
             expected, bad = "finite entries and a diagonal above 0", np.count_nonzero(~np.isfinite(matrix.data))
@@ -81,7 +80,7 @@ class LinearSolver:
         self._slow = False
 
     def solve(self, right_hand_side: Vector) -> LinearSolution:
-        """Solve A x = b for b of shape (n,); a failure is not raised but told by `LinearSolution.converged`."""
+        """Solve A x = b for b of shape (n,); after a failure, `LinearSolution.converged` is False."""
         # b is divided by its largest entry, so that the squares in the norms neither overflow nor vanish.
         b = self._scale * right_hand_side
         unit = float(np.max(np.abs(b), initial=0.0)) or 1.0
@@ -118,10 +117,8 @@ class LinearSolver:
 
     @cached_property
     def _multigrid(self) -> LinearOperator:
-        """Return pyamg's smoothed aggregation for the scaled matrix, a symmetric and deterministic preconditioner.
-
-        Row sums ("local") replace a random estimate of the spectral radius; B is a constant x in scaled unknowns.
-        """
+        """Smoothed-aggregation multigrid (pyamg) for the scaled matrix, a symmetric and deterministic preconditioner.
+        Row sums ("local") replace a random estimate of the spectral radius. The near-null space B is a constant x."""
         from pyamg import smoothed_aggregation_solver
 
         levels = smoothed_aggregation_solver(
@@ -145,36 +142,36 @@ def _threads() -> ThreadpoolController:
 
 @dataclass(frozen=True)
 class Residual:
-    """Heat that an implicit equation leaves unbalanced at trial temperatures: inflow less the heat that is stored."""
+    """Residual of an implicit equation at trial temperatures: heat that flows in minus heat that is stored."""
 
-    heat_w: Vector  # Unbalanced heat at each node, 0 at fixed nodes, shape (n,), [W]
-    whole_w: float  # Unbalanced heat of the body, summed without conduction, [W]; 0 if there are fixed nodes
+    heat_w: Vector  # Residual at each node, 0 at fixed nodes, shape (n,), [W]
+    whole_w: float  # Residual of the whole body, summed without conduction, [W]; 0 if there are fixed nodes
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
-    round_off_w: float  # Round-off to expect in the sum over all free nodes, [W]
+    round_off_w: float  # Expected round-off of the sum over all free nodes, [W]
 
     @cached_property
     def unbalanced_w(self) -> float:
-        """Sum over the nodes of the size of the unbalanced heat, [W].
+        """Sum over the nodes of the residual's absolute value, [W].
 
-        If the matrix has no entry above 0 off its diagonal, no effect's heat flow is wrong by more than this sum,
+        If no off-diagonal entry of the matrix is positive, this sum bounds the error of each effect's heat flow,
         because heat put in at a node leaves through all effects together.
         """
         return float(np.sum(np.abs(self.heat_w)))
 
     @property
     def is_round_off(self) -> bool:
-        """True if the residual is nothing but round-off, both summed over all nodes and of the whole body."""
+        """True if both `unbalanced_w` and `whole_w` are no more than round-off."""
         return max(self.unbalanced_w, abs(self.whole_w)) <= self.round_off_w
 
 
 @dataclass(frozen=True)
 class ImplicitSolution:
-    """The outcome of `ImplicitEquation.solve`: its temperatures solve the equation only if `converged` is True."""
+    """The outcome of `ImplicitEquation.solve`; the temperatures solve the equation only if `converged` is True."""
 
     relative_k: Vector  # Temperatures T, relative to `HeatSystem.reference_c`, shape (n,), [K]
     change_k: Vector
-    """The change T - T_0 as solved for, shape (n,), [K]; a difference of temperatures would lose its last digits."""
-    unbalanced_w: float  # Sum of the sizes of the unbalanced heat at all nodes, plus round-off, [W]
+    """The unknown T - T_0 itself, shape (n,), [K]; a subtraction of temperatures would lose its last digits."""
+    unbalanced_w: float  # `Residual.unbalanced_w` plus round-off, [W]
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
     iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
@@ -185,13 +182,13 @@ class ImplicitSolution:
 class ImplicitEquation:
     """Solver of M (T - T_0) / step = given + load - (K + R) T + radiation(T); step = inf: the steady state.
 
-    M is the mass, K the stiffness and R the convection matrix; the load holds convection's h T_ambient, too. A stage of
-    a diagonally implicit Runge-Kutta scheme has this form, `given` being the heat from earlier stages. The unknown is
+    M is the mass, K the stiffness and R the convection matrix. The load includes convection's h T_ambient. A stage of a
+    diagonally implicit Runge-Kutta scheme has this form; `given` is then the heat from earlier stages. The unknown is
     T - T_0, so that round-off is relative to the change. Without radiation one matrix serves all steps of one length.
 
-    Conduction moves no heat out of a body, so the heat that a body without fixed nodes stores and exchanges sets its
-    mean change. In long steps of insulated bodies the matrix is all but singular, and the linear solver would lose this
-    mean; therefore the mean is corrected afterwards.
+    Conduction moves no heat out of a body. If a body has no fixed nodes, its mean change thus follows from the heat
+    that it stores and exchanges. In long steps of insulated bodies the matrix is nearly singular and the linear solver
+    loses this mean, so the mean is corrected afterwards.
     """
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
@@ -203,7 +200,7 @@ class ImplicitEquation:
         if convection is not None:
             self._row_sums_w_k += convection @ np.ones(system.num_nodes)
         self._sizes_w_k: Vector = system.stiffness.diagonal() + self._row_sums_w_k
-        """About the diagonal of K + R, shape (n,), [W / K], from which round-off is estimated."""
+        """Diagonal of K plus row sums of R, shape (n,), [W / K]; round-off is estimated from it."""
         if np.isfinite(step_s):
             self._row_sums_w_k += system.nodal_mass_j_k / step_s
         self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
@@ -211,12 +208,13 @@ class ImplicitEquation:
         self._solvers: dict[float, LinearSolver] = {}
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
-        """Solve for T at `time_s` from `start_k`, T_0, (n,), [K]; `given_w` is the heat of earlier stages, (n,), [W].
+        """Solve for T at `time_s`, given T_0 = `start_k`, (n,), [K], relative to `HeatSystem.reference_c`.
 
-        Emitted heat grows with the temperature and its slope is symmetric, so the solution is the one minimum of a
-        convex energy. Newton's direction leads downhill, and a line search finds the length to go as the zero of an
-        increasing function. So no damping factor is guessed, and the method converges from any start. Without radiation
-        the first step is the solution, and further steps correct the error of the linear solver.
+        `given_w`, (n,), [W], is the heat of earlier stages; None is 0. Emitted heat increases with the temperature and
+        has a symmetric Jacobian, so the solution is the minimum of a convex energy. Newton's direction is a descent
+        direction, and a line search finds the step length as the zero of an increasing function. The method therefore
+        converges from any start without a damping factor. Without radiation the first step is the solution, and further
+        steps correct the error of the linear solver.
         """
         fixed, nonlinear, change_k = self._system.fixed, self._system.nonlinear, np.zeros(self._system.num_nodes)
         if len(fixed.nodes):
@@ -262,9 +260,9 @@ class ImplicitEquation:
     def correction(
         self, heat_w: Vector, whole_w: float, relative_k: Vector, time_s: float, tolerance: float
     ) -> tuple[Vector, LinearSolution]:
-        """Solve (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w` for the change e, (n,), [K].
+        """Return the Newton step e, (n,), [K]: (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w`.
 
-        `whole_w`, [W], is the sum of `heat_w` without conduction and its round-off.
+        `whole_w`, [W], is the sum of `heat_w` (n,) computed without conduction. `tolerance` is relative.
         """
         row_sums_w_k = self._row_sums_w_k
         if self._system.nonlinear:
@@ -291,7 +289,7 @@ class ImplicitEquation:
         return sparse.csr_matrix(matrix[fixed.free][:, fixed.free]) if len(fixed.nodes) else matrix
 
     def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
-        """Return the heat that is unbalanced at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
+        """Return the residual at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
         system, now_k = self._system, start_k + change_k
         conducted_w, parts_w = system.conducted_heat(now_k), system.exchange_parts(now_k, time_s)
         if np.isfinite(self._step_s):
@@ -313,7 +311,8 @@ class ImplicitEquation:
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
 
     def _length(self, now_k: Vector, direction: Vector, heat_w: Vector, time_s: float) -> float:
-        """Return the share of a Newton direction to go: 1, or about the share at which the energy is least."""
+        """Return the step length along a Newton direction: 1, or about the length in [0, 1] of least energy. `heat_w`
+        (n,) is the residual at `now_k` (n,), the temperatures before the step."""
         if self._is_short(now_k, direction, _SAFE):
             return 1.0
         free = self._at_free(direction)
@@ -321,7 +320,7 @@ class ImplicitEquation:
         constant, curvature = np.sum(direction * (heat_w - radiated_w)), np.sum(free * (self._matrix @ free))
 
         def rise(length: float) -> float:
-            """Return the slope of the energy at this length: minus the sum of residual times direction."""
+            """Return the derivative of the energy at this length: minus the sum of residual times direction."""
             then_w = self._system.radiation_load(now_k + length * direction, time_s)
             return float(length * curvature - constant - np.sum(direction * then_w))
 

@@ -1,4 +1,4 @@
-"""Stiffness and lumped mass of linear tetrahedra (P1), the edges of a mesh, and meshes of half the size."""
+"""Stiffness and lumped mass of linear tetrahedra (P1), the edges of a mesh, and uniform refinement."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from thermoxels_ns.mesh.quality.tet_shapes import edge_stiffness, flatness, sign
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 FLATTEST = 1e-6
-"""Least height of a tetrahedron over its size. In a flatter one, conduction along its plane is lost to round-off beside
-conduction through its thickness, which is 1 / `FLATTEST`^2 times as large."""
+"""Least `flatness` of a tetrahedron. In a flatter one, conduction through the thickness is more than 1 / `FLATTEST`^2
+times conduction along the plane, and round-off hides the latter."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
-"""Local numbers of the two ends of each edge of a tetrahedron, in scikit-fem's order."""
-FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # The same for the edges of a triangle
+"""Local numbers of the two ends of each edge of a tetrahedron, shape (6, 2), in scikit-fem's order."""
+FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # Local numbers of the two ends of each edge of a triangle, (3, 2)
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,9 @@ class MeshEdges:
         return 0.5 * (nodal[self.ends[:, 0]] + nodal[self.ends[:, 1]])
 
     def numbers(self, elements: IntArray, ends: IntArray) -> IntArray:
-        """Return the numbers of the j edges, (k, j), of k tets or triangles; `ends` is `TET_EDGES` or `FACET_EDGES`.
+        """Return the numbers, rows of `self.ends`, of the edges of k tetrahedra or triangles, shape (k, j).
+
+        `elements` (k, 4 or 3) are their nodes, and `ends` is `TET_EDGES` or `FACET_EDGES` (j is 6 or 3).
 
         >>> edges = mesh_edges(np.array([[3, 0, 2, 1]]), 4)
         >>> edges.numbers(np.array([[0, 2, 3]]), FACET_EDGES).tolist()
@@ -59,12 +61,11 @@ def _keys(pairs: IntArray, num_nodes: int) -> IntArray:
 
 
 def stiffness_matrix(points_m: FloatArray, tets: IntArray, conductivity_w_mk: FloatArray) -> sparse.csr_matrix:
-    """Assemble K, entries k * integral(grad phi_i . grad phi_j), shape (n, n), [W / K], symmetric bit for bit.
+    """Return the stiffness matrix, k * integral(grad phi_i . grad phi_j), (n, n), [W / K], symmetric bit for bit.
 
-    The result is that of `space.conduction` through scikit-fem, in a fraction of the time and of the memory of whole
-    runs (`tests/benchmarks/heat_speed.py`). `points_m` has shape (n, 3), [m], `tets` (t, 4), checked by
-    `refuse_flat_tets`; the conductivity has shape (t,), [W / (m K)], above 0. Nodes between which only right angles lie
-    have no entry.
+    The result equals that of scikit-fem with `space.conduction`, in a fraction of the time and of the memory
+    (`tests/benchmarks/heat_speed.py`). `points_m` has the shape (n, 3), [m], and `conductivity_w_mk` (t,), above 0. The
+    caller must check `tets` (t, 4) by `refuse_flat_tets`. Entries that are 0 because of right angles are not stored.
 
     >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
@@ -84,9 +85,10 @@ def stiffness_matrix(points_m: FloatArray, tets: IntArray, conductivity_w_mk: Fl
 
 @kernel
 def _sums_at_edges(tets: IntArray, entries: FloatArray, start: IntArray):
-    """Return the sum of the entries, (t, 6), of each edge, and its larger node; edges with zeros alone are left out.
+    """Return data and column indices of the upper triangle of a CSR matrix: sums of `entries`, (t, 6), at each edge.
 
-    Edges follow the order of their smaller nodes; `start`, (n + 1,), all 0, becomes the place of each one's first edge.
+    The row is the smaller node of an edge, the column the larger one. Columns of a row are not sorted; edges whose
+    entries are all 0 are left out. `start`, (n + 1,), must be 0 and is overwritten with the matrix's row pointer.
     """
     for t in range(len(tets)):
         for e in range(6):
@@ -116,17 +118,17 @@ def _sums_at_edges(tets: IntArray, entries: FloatArray, start: IntArray):
 
 
 def lumped_mass(points_m: FloatArray, tets: IntArray, heat_capacity_j_m3k: FloatArray) -> FloatArray:
-    """Return rho c * integral(phi_i) for every node i, the row sums of the mass matrix, shape (n,), [J / K].
+    """Return the lumped mass rho c * integral(phi_i) of every node i, the mass matrix's row sums, shape (n,), [J / K].
 
-    With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature within
-    the initial range for any step length (Li and Huang, arXiv 1209.5657). The capacity, (t,), is in [J / (m3 K)].
+    If no dihedral angle is obtuse, as in voxels, backward Euler with this mass keeps every temperature within the
+    initial range for any step length (Li and Huang, arXiv 1209.5657). The capacity rho c has the shape (t,).
     """
     quarters = np.repeat(0.25 * heat_capacity_j_m3k * signed_volumes(points_m, tets), 4)
     return np.bincount(tets.ravel(), quarters, len(points_m)).astype(np.float64, copy=False)
 
 
 def refuse_flat_tets(points_m: FloatArray, tets: IntArray) -> None:
-    """Raise `HeatError` if tetrahedra of a mesh that `TetMesh.check` accepts are inverted or flat."""
+    """Raise `HeatError` if a tetrahedron is inverted or flatter than `FLATTEST`; `TetMesh.check` must have passed."""
     num_flat = np.count_nonzero(~(flatness(points_m, tets) > FLATTEST))
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
@@ -135,15 +137,15 @@ def refuse_flat_tets(points_m: FloatArray, tets: IntArray) -> None:
 
 
 def refine_mesh(mesh: TetMesh) -> TetMesh:
-    """Return a conforming mesh of the same body with all edges halved: each tetrahedron becomes eight.
+    """Return a uniform refinement: a conforming mesh of the same body with eight tetrahedra in place of each.
 
-    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron, which is
-    cut into four along the shortest of its three diagonals, as scikit-fem does. Children of the six tetrahedra of a
-    cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
+    The four corners of a tetrahedron become children of the same shape. The octahedron between them is cut into four
+    along the shortest of its three diagonals, as scikit-fem does. Children of the six tetrahedra of a cube (Kuhn) are
+    such tetrahedra as well, so no angle becomes obtuse.
 
-    Nodes keep their numbers; the middles of the edges follow in the order of `mesh_edges`. Children inherit regions,
-    tags and patches and stand in the order of their parents. Temperatures and colours of new nodes are means, and a new
-    node counts as observed if both ends of its edge are observed.
+    Nodes keep their numbers; the midpoints of edges follow in the order of `mesh_edges`. Children have the order,
+    regions, tags and patches of their parents. Temperatures and colours of new nodes are means, and a new node counts
+    as observed if both ends of its edge are observed.
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
     num_nodes, (low, high) = len(mesh.points_m), edges.ends.T
@@ -170,11 +172,11 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     )
 
 
-_OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Pairs of middles of opposite edges; numbers 4 to 9 follow `TET_EDGES`
+_OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Pairs of midpoints of opposite edges; 4 + e is the midpoint of `TET_EDGES[e]`
 
 
 def _children() -> IntArray:
-    """Return the local nodes of the 8 children for each of 3 diagonals, shape (3, 8, 4); 4 to 9 are middles."""
+    """Return the local nodes of the 8 children for each of 3 diagonals, shape (3, 8, 4); 4 to 9 are midpoints."""
     middle = {frozenset(map(int, ends)): 4 + number for number, ends in enumerate(TET_EDGES)}
     corners = [[i if j == i else middle[frozenset((i, j))] for j in range(4)] for i in range(4)]
     place = np.vstack([np.zeros(3), np.eye(3)])
@@ -191,12 +193,12 @@ def _children() -> IntArray:
 
 _CHILDREN = _children()
 _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-"""Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
-_TIE = 1.0 - 1e-9  # Diagonals shorter than the others by less than this factor count as equal: the first one is taken
+"""Local nodes of a triangle's children, (4, 3): 0 to 2 are the corners, 3 to 5 the midpoints of `FACET_EDGES`."""
+_TIE = 1.0 - 1e-9  # A later diagonal is taken only if it is shorter than this factor times the shortest before
 
 
 def _diagonals(points: FloatArray, local: IntArray) -> IntArray:
-    """Return for each tetrahedron the number of the shortest diagonal of its octahedron, shape (t,)."""
+    """Return the number (0 to 2) of the shortest diagonal of the octahedron in each tetrahedron, shape (t,)."""
     lengths = [np.linalg.norm(points[local[:, a]] - points[local[:, b]], axis=1) for a, b in _OPPOSITE]
     chosen, best = np.zeros(len(local), np.int64), lengths[0]
     for option in (1, 2):

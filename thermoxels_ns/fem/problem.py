@@ -1,4 +1,4 @@
-"""A heat problem: body, materials, start, effects and their quantities; and the time steps in which it is followed."""
+"""A heat problem: body, materials, initial temperatures, effects with their quantities; and time steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from thermoxels_ns.fem.selection import Places, Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_CONTRAST = 1e9
-"""Most that the largest conductivity of a body may be over the smallest; above it, round-off swamps the smaller one."""
+"""Largest ratio of two conductivities in a body; above this ratio, the smaller one is lost to round-off."""
 
 
 Count: TypeAlias = Annotated[int, Field(ge=1, le=10_000_000)]  # Steps, or kept times: nineteen years of minutes
@@ -56,7 +56,7 @@ class TimeSteps:
 
 @record(HeatError)
 class AdaptiveSteps:
-    """Time steps as long as a tolerance allows.
+    """Time steps whose length follows from a tolerance of the error.
 
     >>> AdaptiveSteps(3600.0, outputs=3).times_s.tolist()
     [0.0, 1200.0, 2400.0, 3600.0]
@@ -64,8 +64,8 @@ class AdaptiveSteps:
 
     duration_s: Seconds  # Time over which to follow the body, [s], above 0
     tolerance_k: Annotated[float, Field(gt=0.0)] = 0.05
-    """Largest error of any temperature that the steps may make, by the estimate of the scheme, [K]. The default is half
-    of the error that building physics allows (ISO 10211: 0.1 K)."""
+    """Largest error of any temperature that time steps may cause, by the estimate of the scheme, [K]. The default is
+    half of the error that building physics allows (ISO 10211: 0.1 K)."""
     outputs: Count = 10  # Number of equal intervals at whose ends temperatures are kept
 
     @property
@@ -76,7 +76,7 @@ class AdaptiveSteps:
 
 @dataclass(frozen=True)
 class Varying:
-    """A quantity that differs from place to place or changes with time.
+    """A quantity that varies with the place or with time.
 
     >>> sunrise = Varying(lambda places, time_s: 100.0 * min(time_s / 3600.0, 1.0))
     >>> sunrise.function(Places(np.zeros((2, 3)), np.zeros((2, 3))), 1800.0)
@@ -84,18 +84,16 @@ class Varying:
     """
 
     function: Callable[[Places, float], npt.ArrayLike]
-    """Function of the places and of the time in seconds since the start; it returns one number per place, shape (k,),
-    or one number for all places."""
-    in_time: bool = True  # True if the numbers change with time; False: they are always those at the time 0
-    resolution_s: float = math.inf
-    """Longest time between two evaluations that misses no change, above 0, [s]; no adaptive step is longer."""
+    """Function of the places and of the time, [s]; returns one number per place, (k,), or one for all places."""
+    in_time: bool = True  # True if the numbers change with time; False: the numbers at time 0 are used at all times
+    resolution_s: float = math.inf  # Longest time step that misses no change, above 0, [s]; adaptive steps obey it
 
 
 def tabulated(times_s: FloatArray, values: FloatArray) -> Varying:
     """Return a quantity that is interpolated linearly between the entries of a table of times and values.
 
-    Before the first entry it has the first value, after the last entry the last value. Adaptive steps are no longer
-    than the shortest time between two entries, so that no entry is stepped over.
+    The quantity has the first value before the first time, and the last value after the last time. Adaptive steps are
+    no longer than the shortest time between two entries, so that they miss no entry.
 
     Args:
         times_s: Times, ascending, at least two, shape (k,), [s].
@@ -129,18 +127,18 @@ def values_at(quantity: Quantity, places: Places, time_s: float) -> FloatArray:
 
 
 class Effect:
-    """Something that acts on a body, such as convection: checked input that `forms` turns into vectors and matrices.
+    """Something that acts on a body, such as convection; the module `forms` makes vectors and matrices of it.
 
-    A subclass is a dataclass, whose first field names the patches or regions that the effect acts on.
+    A subclass must be a dataclass whose first field names the patches or regions on which the effect acts.
     """
 
     kind: ClassVar[str]  # Name of this kind of effect in reports
     form: ClassVar[Literal["convection", "flux", "radiation", "source", "fixed"]]
-    """What the effect adds to the heat equation. Heat flows and fluxes are positive into the body."""
+    """Kind of term that the effect adds to the heat equation. Heat flows and fluxes are positive into the body."""
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """The numbers in the equation, by `form`; in these, temperatures are in degrees Celsius.
+        """The coefficients of the term, by `form`; temperatures among them are in degrees Celsius.
 
         convection: h, T_ambient of the flux h (T_ambient - T). flux: the factors whose product is the flux. radiation:
         eps, T_s, sigma of the flux sigma eps (T_s^4 - T^4). source: heat, [W / m3]. fixed: temperature of the nodes.
@@ -149,7 +147,7 @@ class Effect:
 
     @property
     def where(self) -> tuple[str, ...]:
-        """Names or patterns of the patches, or of the regions, that the effect acts on."""
+        """Names or patterns of the patches (for a source: of the regions) on which the effect acts."""
         return next(iter(vars(self).values()))
 
     @property
@@ -163,9 +161,9 @@ class Effect:
         return tuple(one for one in vars(self).values() if isinstance(one, Varying) and one.in_time)
 
     def parts(self, selection: Selection) -> IntArray:
-        """Return the numbers of the triangles, of a source the tetrahedra, where the effect acts, shape (k,).
+        """Return the numbers of the triangles (for a source: tetrahedra) on which the effect acts, shape (k,).
 
-        Raises `HeatError` if the mesh lacks what `where` names.
+        Raises `HeatError` if an entry of `where` matches no patch or region of the mesh.
         """
         return (selection.tets if self.form == "source" else selection.facets)(self.where)
 
@@ -196,18 +194,18 @@ class Material:
 
 @dataclass(frozen=True)
 class HeatProblem:
-    """A body with materials, start and effects; raises `HeatError` if the parts do not fit together.
+    """A heat problem: rho c dT/dt = div(k grad T) + s in a body, T = T0 at the start, and effects on its boundary.
 
-    Inside rho c dT/dt = div(k grad T) plus any source, and T = T0 at the start. Where no effect acts, the boundary is
-    insulated: k grad T . n = 0, n being the outward normal.
+    The source s is 0 unless effects add one. Boundary without an effect is insulated: k grad T . n = 0 with the outward
+    normal n. Raises `HeatError` if the mesh is damaged or has flat tetrahedra or unused nodes, or if materials or
+    initial temperatures are missing or not possible.
     """
 
     mesh: TetMesh  # The body
     material: Material | Mapping[str, Material]
     """Material of the whole body, or a mapping from the name of each region of the mesh to its material."""
     initial_temperature_c: FloatArray | None = None
-    """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: that of the mesh. A steady solver starts its
-    iterations from this temperature."""
+    """Nodal temperature T0, (n,), [degrees Celsius]; None: as in the mesh. Steady solvers start iterations from it."""
     effects: tuple[Effect, ...] = ()  # Effects that act on the body; several may act on one patch
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, for effects that depend on it
 
@@ -233,7 +231,7 @@ class HeatProblem:
 
     @property
     def resolution_s(self) -> float:
-        """Longest time between two evaluations at which no effect's change is missed, [s]; inf if unknown."""
+        """Least `Varying.resolution_s` of all quantities that change with time, [s]; inf if there is none."""
         return min((one.resolution_s for effect in self.effects for one in effect.changing), default=math.inf)
 
     @property
@@ -254,7 +252,7 @@ class HeatProblem:
 
     @cached_property
     def materials(self) -> dict[str, Material]:
-        """The material of each region that has tetrahedra, by its name."""
+        """The material of each region that has tetrahedra, by the region's name."""
         one, used = self.material, [self.mesh.region_names[number] for number in np.unique(self.mesh.region)]
         return {name: one if isinstance(one, Material) else one[name] for name in used}
 

@@ -1,4 +1,4 @@
-"""Where effects act: named patches of the boundary, regions of the body, and places on and in them."""
+"""Choice of the patches and regions on which effects act, by name, and places on and in them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 @dataclass(frozen=True)
 class Places:
-    """The k places where a quantity is evaluated: centroids of boundary triangles, points in tetrahedra, or nodes."""
+    """The k places at which a quantity is evaluated: centroids of boundary triangles, points in tetrahedra, nodes."""
 
     points_m: FloatArray  # Positions, shape (k, 3), [m]
     normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 in tetrahedra and at nodes
@@ -27,13 +27,12 @@ class Places:
 
 
 class Selection:
-    """A mesh's patches and regions, which effects name, and the geometry of its f boundary triangles."""
+    """The patches and regions of a mesh, by name, and the geometry of its f boundary triangles."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Take a mesh that `TetMesh.check` accepts; `up` is the unit vector for `Places.up`."""
+        """Keep a mesh, for which `TetMesh.check` must have passed; `up` is the unit vector for `Places.up`."""
         self.mesh, self.up = mesh, up
-        self.patch_names: tuple[str, ...] = mesh.boundary.patch_names
-        """Names of the patches."""
+        self.patch_names: tuple[str, ...] = mesh.boundary.patch_names  # Names of the patches
         self.facet_patch: IntArray = mesh.boundary.patch
         """Patch of each boundary triangle, as an index into `patch_names`, shape (f,)."""
 
@@ -54,24 +53,24 @@ class Selection:
         return facet_normals(self.mesh.points_m, self.mesh.facets)
 
     def facets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Return the numbers of the triangles of patches that match a pattern; `HeatError` if a pattern fits none."""
+        """Return the numbers of the triangles of matching patches; raise `HeatError` if a pattern matches none."""
         chosen = np.isin(self.patch_names, [*chosen_names("patches", self.patch_names, patterns)])
         return np.flatnonzero(chosen[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Return the numbers of the tetrahedra of regions that match a pattern; `HeatError` if a pattern fits none."""
+        """Return the numbers of the tetrahedra of matching regions; raise `HeatError` if a pattern matches none."""
         names = self.mesh.region_names
         chosen = np.isin(names, [*chosen_names("regions", names, patterns, "regions")])
         return np.flatnonzero(chosen[self.mesh.region])
 
     def facet_places(self, facets: IntArray) -> Places:
-        """Return the centroids of boundary triangles as places with outward normals."""
+        """Return the centroids of the boundary triangles with the numbers `facets`, with outward normals."""
         centroids = self.mesh.points_m[self.mesh.facets[facets]].mean(axis=1)
         return Places(centroids, self.facet_normal[facets], self.up)
 
 
 def matching_names(names: Collection[str], pattern: str) -> list[str]:
-    """Return the names that match a pattern; without `*`, `?` and `[` the pattern matches only the name equal to it.
+    """Return the names that match a pattern; a pattern without `*`, `?` and `[` matches only the equal name.
 
     >>> [matching_names(["wall-7", "wall"], pattern) for pattern in ("wall-7", "wall*", "Wall")]
     [['wall-7'], ['wall-7', 'wall'], []]
@@ -88,7 +87,8 @@ def chosen_names(
     what: str = "patches",
     error: type[ThermoxelsError] = HeatError,
 ) -> set[str]:
-    """Return those of `names` that match a pattern; raises an `error` about entry `name` if a pattern has no match."""
+    """Return the `names` that match at least one pattern; raise `error` about the entry `name` if one matches none. The
+    message calls the names `what`."""
     chosen = set[str]()
     for pattern in patterns:
         found = matching_names(names, pattern)

@@ -1,4 +1,4 @@
-"""Solutions of heat problems, and their temperatures on a mesh that can be shown."""
+"""Solutions of heat problems, and their temperatures on a mesh of linear tetrahedra."""
 
 from __future__ import annotations
 
@@ -25,19 +25,18 @@ class EffectHeat:
 
     effect: str  # Label of the effect, from `effect_labels`
     heat_w: FloatArray
-    """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative where
-    heat leaves. A steady state has one interval."""
+    """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative if heat
+    leaves. A steady state has one interval."""
     group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that the effect acts on
     group_heat_w: FloatArray  # `heat_w` of each patch or region alone, shape (s, g), [W]
 
 
 @dataclass(frozen=True)
 class ErrorSize:
-    """Sizes of the errors of a solution."""
+    """Estimated largest errors of a solution."""
 
     temperature_k: float  # Largest error of the temperature at the nodes of the given mesh, [K]
-    heat_flow: float
-    """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
+    heat_flow: float  # Largest error of an effect's mean heat flow, as a share of all heat that flows through the body
 
     def describe(self) -> str:
         """Return both errors as text, such as "0.05 K and 1 % of the heat flow"."""
@@ -46,19 +45,17 @@ class ErrorSize:
 
 @dataclass(frozen=True)
 class HeatSolution:
-    """Temperatures of n nodes over s intervals of time, and the account of the heat."""
+    """Temperatures of n nodes over s intervals of time, and the heat balance."""
 
     times_s: FloatArray  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: FloatArray
-    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Nodes of fixed temperature have this temperature already
-    at the start."""
+    """Nodal temperatures, (s + 1, n), [degrees Celsius]; fixed nodes have their fixed temperature also at the start."""
     heat_w: FloatArray
-    """Mean net heat flow into the body in each interval, the change of the heat content over the interval's length,
-    shape (s,), [W]. In a body with insulated boundary and without sources the flow is 0 up to round-off."""
-    heat_content_j: FloatArray
-    """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
+    """Mean net heat flow into the body in each interval, shape (s,), [W]: the change of the heat content divided by the
+    interval's length. Without boundary effects and sources the flow is 0 up to round-off."""
+    heat_content_j: FloatArray  # Heat content above absolute zero at each time, 1^T M T with T in kelvin, (s + 1,), [J]
     energy_residual: float
-    """Largest change of the heat content that no heat flow accounts for, relative to the heat in the initial
+    """Largest change of the heat content without a heat flow as its cause, relative to the heat of the initial
     differences, sum m_i |T_i - mean T|, plus all heat exchanged."""
     status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
@@ -67,41 +64,41 @@ class HeatSolution:
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0  # Number of steps
     time_error_k: float = math.nan
-    """Estimated largest error that the steps make in any temperature, [K]. Adaptive steps: the sum of their estimates;
-    equal steps: from steps of twice the length, if asked for; else NaN."""
-    unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
+    """Estimated largest error of any temperature due to the time steps, [K]. Adaptive steps: the sum of their
+    estimates. Equal steps: from a solution with steps twice as long, or NaN if it was not asked for."""
+    unbalanced_w: float = 0.0  # Largest heat that a step left unbalanced, summed over all nodes, plus round-off, [W]
     overshoot_k: float = 0.0
-    """Most by which a temperature left the range of the start and of the surroundings, [K]; 0 if at most 0.01 K."""
+    """Largest distance of a temperature outside the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
     facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """Heat flow into the body through each boundary triangle at the end, as if fixed nodes stored nothing, [W]."""
+    """Heat flow into the body through each triangle at the end, (f,), [W], as if fixed nodes stored no heat."""
 
 
 @dataclass(frozen=True)
 class SteadySolution:
-    """Temperatures that no longer change, and the account of the heat."""
+    """Temperatures of a steady state, and the heat balance."""
 
     temperature_c: FloatArray  # Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]
     effects: tuple[EffectHeat, ...]
     """Heat that each effect of the problem brings, in the order of the problem; the heat flows add up to 0."""
-    energy_residual: float  # Half the size of the sum of all heat flows, which should be 0, over the heat that flows
+    energy_residual: float  # Half the absolute sum of all heat flows (ideally 0) divided by the heat that flows
     status: str  # Sentences on how the iterations converged
     iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
     edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
-    empty with linear tetrahedra."""
+    """Temperatures at midpoints of edges, in the order of `mesh_edges`, (e,), [degrees Celsius]; empty if linear."""
     unbalanced_w: float = 0.0
-    """Heat that is unbalanced at all nodes, round-off included, [W]; no heat flow is more uncertain than this."""
-    overshoot_k: float = 0.0  # Most by which a temperature is out of the surroundings' range, [K]; 0 if at most 0.01 K
+    """Unbalanced heat summed over all nodes, plus round-off, [W]; no heat flow is more uncertain than this."""
+    overshoot_k: float = 0.0  # Largest distance of a temperature outside the surroundings' range, [K]; 0 up to 0.01 K
     facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
     """Heat flow into the body through each boundary triangle, shape (f,), [W]."""
-    error: ErrorSize | None = None  # Errors of the mesh as `tolerance.steady_error` estimates them; None: no estimate
+    error: ErrorSize | None = None  # Errors due to the mesh, as `tolerance.steady_error` estimates them, if it did
 
 
 def heat_by_effect(
     effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: FloatArray
 ) -> tuple[EffectHeat, ...]:
-    """Sort heat flows `group_heat_w`, (s, g), [W], by effect; `groups` has effect and patch or region per column."""
+    """Return heat flows by effect, in the order of the labels `effects`. `group_heat_w` (s, g), [W], has a column per
+    group; `groups` has an effect's label and a patch or region per column."""
     columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
         columns[owner].append((number, name))
@@ -112,20 +109,20 @@ def heat_by_effect(
     return tuple(found)
 
 
-Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
+Solution: TypeAlias = HeatSolution | SteadySolution  # A solution through time or of a steady state
 
 _CHILD_FACETS = 4  # Triangles into which `refine_mesh` cuts a triangle
 _EQUAL = 1e-9  # Temperatures that differ by at most this share of the absolute temperature count as equal
 
 
 def mean_flows_w(solution: Solution) -> dict[str, float]:
-    """Return the mean heat flow into the body over all times by effect, [W]."""
+    """Return the mean heat flow over time into the body by effect label, [W]."""
     lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
     return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
 def share_of_heat(heat_w: float, solution: Solution) -> float:
-    """Return a heat flow as a share of all heat that flows through the body on average; 0 if temperatures are equal."""
+    """Return `heat_w` divided by the mean heat that flows through the body; 0 if all temperatures are equal."""
     level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
     if heat_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
         return 0.0
@@ -135,16 +132,16 @@ def share_of_heat(heat_w: float, solution: Solution) -> float:
 
 @dataclass(frozen=True)
 class SolutionNodes:
-    """All temperatures of a solution on a mesh of linear tetrahedra with a node for each unknown."""
+    """All temperatures of a solution on a mesh of linear tetrahedra that has a node for each unknown."""
 
     mesh: TetMesh
-    """The mesh that was solved; for quadratic tetrahedra refined once, which puts a node at the middle of each edge."""
+    """The mesh of the problem; for quadratic tetrahedra refined once, so that each edge has a node at its midpoint."""
     times_s: Vector  # Times, shape (s,), [s]; 0 alone for a steady state
     states_c: Vector  # Nodal temperatures, shape (s, n), [degrees Celsius]
     quadratic: bool  # True if the tetrahedra that were solved are quadratic
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:
-        """Return values per boundary triangle of `mesh`, (f, ...), from those per triangle of the unrefined mesh."""
+        """Return values per boundary triangle of `mesh`, (f, ...), from values per triangle of the problem's mesh."""
         return np.repeat(values, _CHILD_FACETS, axis=0) if self.quadratic else values
 
 

@@ -22,29 +22,29 @@ Vector = FloatArray
 Numbers = IntArray
 
 _CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
-"""Quadrature at the corners of the reference triangle, for linear tetrahedra: points and weights."""
+"""Points and weights of the quadrature at the corners of the reference triangle, which linear tetrahedra use."""
 _EXACT = 4  # Degree of exact integrals over triangles of quadratic tetrahedra: products of two quadratic functions
 _BLOCK = 2_000  # Tetrahedra assembled at a time, so that scikit-fem's arrays, 4 kB per tetrahedron, fit into a cache
 
 
 @BilinearForm
 def conduction(u, v, w):
-    """Return the integrand k grad u . grad v of the stiffness; `w.conductivity` is k, [W / (m K)]."""
+    """Return the integrand k grad u . grad v of the stiffness matrix; `w.conductivity` is k, [W / (m K)]."""
     return w.conductivity * dot(u.grad, v.grad)
 
 
 class Space:
-    """The n unknowns of a body: one per node of the mesh, then, for quadratic tetrahedra, one per middle of an edge.
+    """The n unknowns of a body: one per node of the mesh, then, for quadratic tetrahedra, one per midpoint of an edge.
 
-    Scikit-fem assembles the matrices of quadratic tetrahedra, `linear_tets` those of linear ones. Convection and
-    radiation are evaluated at the nodes of linear tetrahedra, which keeps temperatures in the range of the
-    surroundings, and are integrated over the triangles of quadratic ones. Quadratic tetrahedra serve steady states
-    only: lumping their mass would make the masses of corners negative, and with the consistent mass temperatures leave
-    their range in steps below about h^2 / diffusivity.
+    Scikit-fem assembles the stiffness of quadratic tetrahedra, `linear_tets` that of linear ones. With linear
+    tetrahedra, convection and radiation are evaluated at the nodes (lumped), which keeps temperatures in the range of
+    the surroundings; with quadratic tetrahedra they are integrated over triangles. Quadratic tetrahedra serve steady
+    states only: lumped masses of their corners would be negative, and with the consistent mass temperatures leave their
+    range in steps below about h^2 / diffusivity.
     """
 
     def __init__(self, selection: Selection, *, order: int = 1) -> None:
-        """Choose linear (`order` 1) or quadratic (2) tetrahedra; raises `HeatError` for any other order."""
+        """Choose linear (`order` 1) or quadratic (2) tetrahedra; raise `HeatError` for any other order."""
         if order not in (1, 2):
             remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
             raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
@@ -67,15 +67,15 @@ class Space:
         return self.from_mesh_nodes(self.selection.mesh.points_m)
 
     def from_mesh_nodes(self, nodal: Vector) -> Vector:
-        """Return values at the unknowns, shape (n, ...), from those at the mesh's nodes; middles of edges get means."""
+        """Return values at the unknowns, shape (n, ...), from values at the mesh's nodes; midpoints get means."""
         return nodal if self.order == 1 else np.concatenate([nodal, self.edges.midpoints(nodal)])
 
     def tet_nodes(self) -> Numbers:
-        """Return the unknowns of each tetrahedron, corners first, then the middles of `TET_EDGES`, shape (t, m)."""
+        """Return the unknowns of each tetrahedron, shape (t, 4 or 10): corners, then midpoints of `TET_EDGES`."""
         return self._element_nodes(self.selection.mesh.tets, TET_EDGES)
 
     def facet_nodes(self, facets: Numbers) -> Numbers:
-        """Return the unknowns of k boundary triangles: corners, then the middles of `FACET_EDGES`, shape (k, m)."""
+        """Return the unknowns of k boundary triangles, (k, 3 or 6): corners, then midpoints of `FACET_EDGES`."""
         return self._element_nodes(self.selection.mesh.facets[facets], FACET_EDGES)
 
     def _element_nodes(self, corners: Numbers, ends: Numbers) -> Numbers:
@@ -84,14 +84,14 @@ class Space:
         return np.concatenate([corners, len(self.selection.mesh.points_m) + self.edges.numbers(corners, ends)], axis=1)
 
     def stiffness(self, conductivity_w_mk: Vector) -> sparse.csr_matrix:
-        """Return K, integral(k grad phi_i . grad phi_j), (n, n), [W / K], for a conductivity k per tetrahedron."""
+        """Return the stiffness matrix integral(k grad phi_i . grad phi_j), (n, n), [W / K], for k of shape (t,)."""
         mesh = self.selection.mesh
         if self.order == 1:
             return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk)
         return self.assembled(conduction, 2, conductivity=conductivity_w_mk)
 
     def assembled(self, form: BilinearForm, degree: int, **tet_values: Vector) -> sparse.csr_matrix:
-        """Return the matrix of a form, (n, n), assembled by scikit-fem and symmetric bit for bit.
+        """Return the matrix of a symmetric form, (n, n), assembled by scikit-fem and symmetric bit for bit.
 
         Quadrature is exact for polynomials of `degree`; `tet_values` are parameters of the form, each of shape (t,).
         """
@@ -118,16 +118,17 @@ class Space:
         return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
     def facet_rule(self, facets: Numbers) -> tuple[Vector, Vector]:
-        """Return the m shape functions at the q points of integration, (m, q), and the points' areas, (k, q), [m2]."""
+        """Return the m shape functions at the q integration points, (m, q), and weights of the points, (k, q), [m2].
+        The weights of a triangle add up to its area. `facets` (k,) are numbers of boundary triangles."""
         points, weights = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
         shapes = np.stack([element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(3 * self.order)])
         return shapes, 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
-        """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3].
+        """Return the integration points of sources, q per tetrahedron, and their weights, shape (k q,), [m3].
 
-        Integrals with them are exact for polynomials of degree `order`.
+        `tets` (k,) are numbers of tetrahedra. Integrals are exact for polynomials of degree `order`.
         """
         (points, weights), mesh = get_quadrature(RefTet, self.order), self.selection.mesh
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
@@ -137,7 +138,7 @@ class Space:
         return Places(places, np.zeros_like(places), self.selection.up), volumes
 
     def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
-        """Spread the heat at the points of `source_points`, shape (k q,), [W], over the nodes, shape (n,), [W]."""
+        """Return the load vector, (n,), [W], of the heat `point_w` (k q,), [W], released at the `source_points`."""
         points, weights = get_quadrature(RefTet, self.order)
         nodes = self.tet_nodes()[tets].T
         shapes = np.stack([self.element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(len(nodes))])
@@ -146,7 +147,7 @@ class Space:
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:
-    """Return the sum of the values that have each of the numbers 0 to count - 1, shape (count,).
+    """Return for each number from 0 to count - 1 the sum of the `values` that have this number, shape (count,).
 
     >>> sums_by_number(np.array([2, 0, 2]), np.array([1.0, 5.0, 3.0]), 4).tolist()
     [5.0, 0.0, 4.0, 0.0]

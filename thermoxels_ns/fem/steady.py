@@ -15,7 +15,7 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
-OVERSHOOT_K = 0.01  # Distance out of its range up to which a temperature is not reported, [K]
+OVERSHOOT_K = 0.01  # A temperature outside its range is reported if it is farther outside than this, [K]
 
 
 def solve_steady(
@@ -24,16 +24,16 @@ def solve_steady(
     order: int = 1,
     relative_tolerance: float = 1e-12,
 ) -> SteadySolution:
-    """Find the temperatures at which the effects of a problem balance: div(k grad T) + s = 0, s being a source.
+    """Return the steady state of a problem: div(k grad T) + s = 0 with the source s, and the effects on the boundary.
 
-    With linear tetrahedra without obtuse angles no temperature leaves the range of the surroundings, unless a flux or
-    source drives it out. If a temperature leaves this range without such a cause, the status says by how much.
+    With linear tetrahedra without obtuse angles, only a flux or source can drive a temperature out of the range of the
+    surroundings. If a temperature leaves this range without such a cause, the status says by how much.
 
     Args:
         problem: Body, materials and effects; effects that change with time act as at the time 0. Iterations start
             from the initial temperatures.
-        order: 1 for linear tetrahedra; 2 for quadratic ones, which have eight times as many unknowns and an error that
-            falls with the cube of the mesh size where the solution is smooth, but may overshoot the surroundings.
+        order: 1 for linear tetrahedra, 2 for quadratic ones. Quadratic ones have eight times as many unknowns. Their
+            error falls with the cube of the mesh size if the solution is smooth, but they may overshoot.
         relative_tolerance: Relative tolerance of the linear solver, and of Newton's method if there is radiation.
 
     Raises:
@@ -68,7 +68,8 @@ def solve_steady(
 
 
 def out_of_range(beyond_k: float) -> tuple[float, str]:
-    """Return how far temperatures leave their range, [K], and a sentence on this; (0, "") up to `OVERSHOOT_K`."""
+    """Return `beyond_k`, the distance of temperatures outside their range, [K], and a sentence on it. The result is (0,
+    "") for a distance up to `OVERSHOOT_K`."""
     if beyond_k <= OVERSHOOT_K:
         return 0.0, ""
     said = f" A temperature left its range by up to {beyond_k:.2g} K: the mesh or the steps do not resolve a jump."
@@ -76,7 +77,7 @@ def out_of_range(beyond_k: float) -> tuple[float, str]:
 
 
 def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
-    """Raise `HeatError` if a temperature is below absolute zero; `relative_k` has shape (n,)."""
+    """Raise `HeatError` if a temperature `relative_k` (n,), minus `system.reference_c`, is below absolute zero."""
     coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
     if coldest_k < -1e-6:
         raise HeatError(
@@ -87,7 +88,7 @@ def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
 
 
 def _check_held(system: HeatSystem) -> None:
-    """Raise `HeatError` if a connected piece has nothing that sets its temperature in a steady state."""
+    """Raise `HeatError` if a connected piece has neither convection, radiation nor a fixed temperature."""
     count, piece = connected_components(system.stiffness, directed=False)
     acting = (form.nodes[form.strength(0.0)[:, 0] > 0.0].ravel() for form in system.surface_forms)
     loose = np.setdiff1d(np.arange(count), piece[np.concatenate([system.fixed.nodes, *acting])])

@@ -1,4 +1,4 @@
-"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T), the load with convection's h T_ambient."""
+"""The discrete heat equation M dT/dt + (K + R) T = load + radiation(T); the load includes convection's h T_ambient."""
 
 from __future__ import annotations
 
@@ -28,47 +28,45 @@ from thermoxels_ns.fem.space import Space, sums_by_number
 Vector = FloatArray
 
 MOST_TIMES_CONDUCTION = 1e10
-"""Largest ratio of the heat per kelvin that convection takes from a node to that which its cells conduct. Above it, the
-surface practically has the temperature of the air, and their difference would be lost to round-off."""
-NOTHING = 1e-9
-"""Differences of temperature below this share of the absolute temperature let no heat flow to speak of."""
+"""Largest ratio of a node's convection to its conduction (diagonals of R and K). Above it, the surface practically has
+the temperature of the air, and their difference would be lost to round-off."""
+NOTHING = 1e-9  # Temperatures count as equal if they differ by less than this share of the absolute temperature
 _LEAST = float(np.finfo(np.float64).tiny)
 _KEPT_RANGES = 64  # Number of times for which the range of the surroundings is kept
 
 
 class HeatSystem:
-    """The matrices and vectors of a `HeatProblem` that time schemes and the steady solver need, n nodes.
+    """The matrices and vectors of a `HeatProblem` with n nodes, for time schemes and the steady solver.
 
-    Constant parts are assembled once. Temperatures are relative to `reference_c`, which keeps round-off small.
+    Constant parts are assembled once. The arguments `relative_k` are nodal temperatures minus `reference_c`, (n,), [K],
+    which keeps round-off small; `time_s` is the time since the start, [s].
     """
 
     def __init__(self, problem: HeatProblem, *, order: int = 1) -> None:
-        """Turn effects into forms and assemble the stiffness; `order` 1: linear tetrahedra, 2: quadratic ones."""
+        """Make forms of the effects and assemble the stiffness; `order` 1: linear tetrahedra, 2: quadratic ones."""
         self.problem = problem
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
-        """Reference temperature: the middle of the range at the start, [degrees Celsius]."""
+        """Reference temperature, [degrees Celsius]: the middle of the range of initial temperatures."""
         self.space: Space = Space(problem.selection, order=order)
-        """The unknowns at the nodes, and the integrals over triangles and tetrahedra."""
+        """The finite element space: unknowns at nodes, and integrals over triangles and tetrahedra."""
         self.num_nodes: int = self.space.num_nodes
-        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
+        """Number of nodes, n: the mesh's nodes and, with quadratic tetrahedra, then the midpoints of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c)
         self._convection = tuple(form for form in forms if isinstance(form, ConvectionForm))
         self._loads = tuple(form for form in forms if isinstance(form, (FluxForm, SourceForm)))
         self._radiation = tuple(form for form in forms if isinstance(form, RadiationForm))
         self._exchanging, self._every_form = (*self._convection, *self._loads, *self._radiation), forms
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
-        """Convection and radiation: the forms whose heat flow depends on the temperature of the surface."""
+        """Forms of convection and radiation, whose heat flow depends on the temperature of the surface."""
         fixed = tuple(form for form in forms if isinstance(form, FixedForm))
-        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
-        """Nodes whose temperature is given."""
+        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)  # Nodes whose temperature is given
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
-        """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
+        """Stiffness matrix K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
         """True if the convection matrix R changes with time."""
-        self.nonlinear: bool = bool(self._radiation)
-        """True if there is radiation."""
+        self.nonlinear: bool = bool(self._radiation)  # True if there is radiation
         groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
         for form in self._every_form:
             names, of_part = problem.mesh.region_names, problem.mesh.region
@@ -78,7 +76,7 @@ class HeatSystem:
             numbers.append(len(groups) + number)
             groups += [(form.effect, names[n]) for n in used]
         self.groups: tuple[tuple[str, str], ...] = tuple(groups)
-        """Effect and patch or region of each heat flow of `by_group`."""
+        """Effect label, and patch or region, of each of the g heat flows that `by_group` returns."""
         self._group: IntArray = np.concatenate(numbers)
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
         self._loads_at: dict[float, Vector] = {}
@@ -87,7 +85,7 @@ class HeatSystem:
 
     @property
     def start_k(self) -> Vector:
-        """Temperatures at the start, relative to `reference_c`, shape (n,), [K]."""
+        """Initial temperatures minus `reference_c`, shape (n,), [K]."""
         return self.space.from_mesh_nodes(self.problem.start_c - self.reference_c)
 
     @cached_property
@@ -97,9 +95,9 @@ class HeatSystem:
         return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
-        """Return R, the heat that convection takes from each node per kelvin, (n, n), [W / K]; None without convection.
+        """Return the sum R of all convection's boundary matrices, (n, n), [W / K]; None without convection.
 
-        Raises `HeatError` if R is more than `MOST_TIMES_CONDUCTION` times K on the diagonal.
+        Raises `HeatError` if a diagonal entry of R is more than `MOST_TIMES_CONDUCTION` times that of K.
         """
         return at_time(self._convection_at, time_s if self.matrix_in_time else 0.0, self._sum_of_convection)
 
@@ -116,7 +114,7 @@ class HeatSystem:
         return total
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
-        """Return M / step + K + R, shape (n, n), [W / K]; for `step_s` = inf return K + R."""
+        """Return M / `step_s` + K + R, shape (n, n), [W / K], or K + R if `step_s` is inf."""
         convection = self.convection_matrix(time_s)
         matrix = self.stiffness if convection is None else sparse.csr_matrix(self.stiffness + convection)
         if np.isinf(step_s):
@@ -124,7 +122,7 @@ class HeatSystem:
         return sparse.csr_matrix(matrix + sparse.diags(self.nodal_mass_j_k / step_s, format="csr"))
 
     def load(self, time_s: float) -> Vector:
-        """Return the heat of fluxes and sources into each node, (n,), [W]; convection's h T_ambient is not included."""
+        """Return the load vector of fluxes and sources, (n,), [W]; convection's h T_ambient is not included."""
         return self._sum_of_loads(self._loads, self._loads_at, time_s)
 
     def _sum_of_loads(
@@ -136,16 +134,16 @@ class HeatSystem:
         return at_time(kept, time_s if any(form.load_in_time for form in forms) else 0.0, add_up)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the net heat that radiation brings to each node, shape (n,), [W]."""
+        """Return the load vector of radiation, the net heat into each node, shape (n,), [W]."""
         return sum((form.load(relative_k, time_s) for form in self._radiation), np.zeros(self.num_nodes))
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
-        """Return minus the derivative of `radiation_load` by the temperatures, shape (n, n), [W / K]."""
+        """Return minus the Jacobian of `radiation_load`, shape (n, n), [W / K]."""
         slopes = (form.slope(relative_k, time_s) for form in self._radiation)
         return sum(slopes, sparse.csr_matrix(self.stiffness.shape))
 
     def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:
-        """Return `load`, then the heat of convection and of radiation into each node if there is any, (n,), [W]."""
+        """Return the heat into each node, (n,), [W], from `load`, then from convection and from radiation if any."""
         parts, convection = [self.load(time_s)], self.convection_matrix(time_s)
         if convection is not None:
             parts.append(self._sum_of_loads(self._convection, self._ambient_at, time_s) - convection @ relative_k)
@@ -160,12 +158,12 @@ class HeatSystem:
     def conducted_heat(self, relative_k: Vector) -> Vector:
         """Return K T, the heat that flows from each node to its neighbours, shape (n,), [W].
 
-        The mean is subtracted from T first: it conducts nothing, but would leave round-off.
+        The mean of T is subtracted first, because it conducts nothing but would cause round-off.
         """
         return self.stiffness @ (relative_k - relative_k.mean())
 
     def net_heat(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat into each node from outside and from its neighbours, shape (n,), [W].
+        """Return `exchanged_heat` minus `conducted_heat`, the net heat into each node, shape (n,), [W].
 
         The heat that keeps fixed nodes at their temperature is not included.
         """
@@ -177,20 +175,21 @@ class HeatSystem:
         return self.net_heat(relative_k, time_s)[nodes] if len(nodes) else np.zeros(0)
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat into each triangle or tetrahedron of every effect but fixed temperatures, [W]."""
+        """Return the heat into the body through each part (triangle, tetrahedron) of each effect, (parts,), [W].
+        Effects follow each other in the order of `groups`. Fixed temperatures are not included."""
         return np.concatenate([np.zeros(0), *(form.part_heat_w(relative_k, time_s) for form in self._exchanging)])
 
     def every_part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return `part_heat_w`, then the heat of fixed temperatures per triangle, as if fixed nodes stored nothing."""
+        """Return `part_heat_w`, then the heat of fixed temperatures per triangle, as if their nodes stored no heat."""
         kept_w = -self.net_heat_at_fixed(relative_k, time_s)
         return np.concatenate([self.part_heat_w(relative_k, time_s), self.fixed.facet_shares @ kept_w])
 
     def by_group(self, heat_w: Vector) -> Vector:
-        """Sum heat flows, in the order of `every_part_heat_w`, over each entry of `groups`, shape (g,), [W]."""
+        """Return the sum over each entry of `groups`, (g,), [W], of heat flows in the order of `every_part_heat_w`."""
         return sums_by_number(self._group[: len(heat_w)], heat_w, len(self.groups))
 
     def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow through each boundary triangle, as if fixed nodes stored nothing, shape (f,), [W]."""
+        """Return the heat into the body through each boundary triangle, as if fixed nodes stored no heat, (f,), [W]."""
         total_w = np.zeros(len(self.problem.mesh.facets))
         ends = np.cumsum([len(form.parts) for form in self._every_form])
         for form, heat_w in zip(self._every_form, np.split(self.every_part_heat_w(relative_k, time_s), ends[:-1])):
@@ -199,14 +198,15 @@ class HeatSystem:
         return total_w
 
     def is_still(self, relative_k: Vector, time_s: float) -> bool:
-        """Return whether all temperatures, of body and surroundings, are equal up to `NOTHING` times absolute ones."""
+        """Return whether all temperatures of body and surroundings are equal within `NOTHING`."""
         ends = np.array([*self.surroundings_k(time_s), relative_k.min(), relative_k.max()])
         ends = ends[np.isfinite(ends)]
         level_k = float(np.abs(ends).max()) + abs(self.reference_c + ZERO_CELSIUS_K)
         return float(np.ptp(ends)) <= NOTHING * level_k
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
-        """Return lowest, highest temperature around the body, [K]; -inf if a flux or source cools, inf if it heats."""
+        """Return the lowest and highest temperature around the body minus the reference, [K]. The lowest is -inf if a
+        flux or source cools the body, the highest is inf if one heats it."""
         return at_time(self._ranges_at, time_s, self._surroundings_k, most=_KEPT_RANGES)
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:

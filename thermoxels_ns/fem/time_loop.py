@@ -1,4 +1,4 @@
-"""Temperatures through time: diagonally implicit Runge-Kutta schemes, and equal, given or adaptive steps of these."""
+"""Temperatures through time by diagonally implicit Runge-Kutta schemes, in equal, given or adaptive steps."""
 
 from __future__ import annotations
 
@@ -22,16 +22,13 @@ Vector = FloatArray
 Progress = Callable[[float, int], None]
 
 STEP_SHARE = 0.1
-"""Largest estimated error of one step, as a share of the tolerance. Conduction damps errors, so that the errors of many
-steps make less than their sum."""
+"""Largest estimated error of one step as a share of the tolerance; conduction damps the errors of earlier steps."""
 _SAFETY = 0.9  # Length of the next step as a share of the longest step that is estimated to meet the tolerance
-_SHRINK, _GROW = 0.2, 5.0
-"""Least and largest factor between the lengths of one step and the next."""
-_KEEP_BELOW = 1.25  # Factor below which a step is not lengthened, so that its matrices serve again
+_SHRINK, _GROW = 0.2, 5.0  # Least and largest ratio of the lengths of the next step and of this one
+_KEEP_BELOW = 1.25  # A step is not lengthened by less than this factor, so that its matrices can be used again
 _SHORTEST = 1e-15  # Shortest step as a share of the duration
 _LEAST = float(np.finfo(np.float64).tiny)
-LEAST_CAPACITY_J_M3K = 1.0
-"""Heat capacity per volume below which a body stores nothing to speak of: a thousandth of that of air, [J / (m3 K)]."""
+LEAST_CAPACITY_J_M3K = 1.0  # Least accepted heat capacity per volume, [J / (m3 K)]: a thousandth of that of air
 _NOTHING = 1e-9  # Share of the heat content above absolute zero below which an exchange of heat is negligible
 _ESTIMATE_TOLERANCE = 1e-3  # Relative tolerance of the linear solver for error estimates
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths of a stage count as equal
@@ -39,33 +36,30 @@ _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths of a stage c
 
 @dataclass(frozen=True)
 class Scheme:
-    """A diagonally implicit Runge-Kutta scheme, given by its coefficients a, b and c.
+    """A diagonally implicit Runge-Kutta scheme with the coefficients a, b and c.
 
-    Notation is that of Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6. Each stage i solves
-    M (T_i - T_n) = dt * sum_j a_ij F(T_j), F being the net heat flow into the nodes; the step ends with M (T_n+1 - T_n)
-    = dt * sum_j b_j F(T_j). So the heat stored in a step is the weighted sum of the stages' flows, and the balance of
-    heat closes at any step length.
+    The notation follows Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6. Each stage i
+    solves M (T_i - T_n) = dt * sum_j a_ij F(T_j) with the net heat flow F into the nodes. The step ends with
+    M (T_n+1 - T_n) = dt * sum_j b_j F(T_j), so the heat balance closes at any step length.
     """
 
     name: str  # Name of the scheme
-    order: int  # Order p: at a given time the error is proportional to the step length to the power p
+    order: int  # Order p: the error at a given time is proportional to the step length to the power p
     weights: tuple[tuple[float, ...], ...]
-    """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as
-    shares of the step; all entries on the diagonal are equal, so that stages share a matrix."""
+    """The lower triangular matrix a, a row per stage; its last row is b. The sum of a row is c, the time of the stage
+    as a share of the step. All diagonal entries are equal, so that stages share a matrix."""
     estimate: tuple[float, ...] | None = None
-    """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
+    """Weights, for the flows at the start and in each stage, of a scheme one order higher; None: no error estimate."""
 
     @property
     def nodes(self) -> tuple[float, ...]:
-        """c: time of each stage as a share of the step."""
+        """The coefficients c, the time of each stage as a share of the step."""
         return tuple(map(math.fsum, self.weights))
 
 
 def _sdirk2() -> Scheme:
-    """Return Alexander's L-stable two-stage scheme (SIAM J. Numer. Anal. 14, 1977), gamma = 1 - 1 / sqrt(2).
-
-    Its estimate also uses the flow at the start, and is of third order if loads are constant.
-    """
+    """Return Alexander's L-stable two-stage scheme (SIAM J. Numer. Anal. 14, 1977), gamma = 1 - 1 / sqrt(2). Its
+    estimate also uses the flow at the start, and is of third order if loads are constant."""
     gamma = 1.0 - 1.0 / math.sqrt(2.0)
     second = (1.0 - gamma) * gamma + gamma
     first_weight = (1.0 / 6.0 - 0.5 * second) / (gamma * gamma - gamma * second)
@@ -75,35 +69,35 @@ def _sdirk2() -> Scheme:
 
 
 BACKWARD_EULER = Scheme("backward Euler", 1, ((1.0,),))
-"""Scheme of first order. With lumped masses and non-obtuse tetrahedra no temperature leaves the range of the start and
-of the surroundings, however long the step."""
+"""Scheme of first order. With lumped masses and non-obtuse tetrahedra, all temperatures are within the range of the
+start and of the surroundings for any step length."""
 SDIRK2 = _sdirk2()
-"""Scheme of second order, L-stable: changes too fast for the step length are damped. Very long steps may overshoot by
-1 or 2 % of a jump."""
+"""Scheme of second order, L-stable: it damps fast changes. Very long steps may overshoot by 1 or 2 % of a jump."""
 
 
 @dataclass(frozen=True)
 class Step:
     """The outcome of `RungeKutta.step`."""
 
-    relative_k: Vector  # Temperatures at the end of the step, relative to the system's reference, shape (n,), [K]
+    relative_k: Vector  # Temperatures at the end of the step, minus the system's reference, shape (n,), [K]
     group_heat_w: Vector  # Mean heat flow into the body for each entry of `HeatSystem.groups`, (g,), [W]
-    range_k: tuple[float, float]  # Range of the surroundings, relative to the reference, see `surroundings_k`, [K]
+    range_k: tuple[float, float]  # Range of `HeatSystem.surroundings_k` at start and end of the step, [K]
     iterations: int  # Iterations of the linear solver in all stages
     newton_iterations: int  # Steps of Newton's method in all stages; 0 without radiation
-    unbalanced_w: float  # Sum of the heat left unbalanced in the stages, [W]
-    error_k: float  # Estimated largest error that the step made, [K]; NaN if none was asked for
+    unbalanced_w: float  # Sum over the stages of `ImplicitSolution.unbalanced_w`, [W]
+    error_k: float  # Estimated largest error of the step, [K]; NaN if no estimate was asked for
 
 
 class RungeKutta:
-    """Takes single steps of any length with a scheme; the matrix of the last used length is kept."""
+    """Solver of single time steps of any length with a scheme; it keeps the matrix of the last length."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, relative_tolerance: float) -> None:
         self.system, self._scheme, self._relative_tolerance = system, scheme, relative_tolerance
         self._kept: tuple[float, float, ImplicitEquation] | None = None
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Take one step from `start_k`, (n,), [K], relative to the reference; `HeatError` if a stage is not solved."""
+        """Return a step of length `step_s` from `start_k`, (n,), [K], minus the reference, at time `time_s`. The error
+        is estimated if `estimate` is True. Raises `HeatError` if a stage does not converge."""
         system, scheme, nothing_w = self.system, self._scheme, np.zeros(self.system.num_nodes)
         states, inner_w, solutions = list[Vector](), list[Vector](), []
         for row, node, implicit in zip(scheme.weights, scheme.nodes, np.diag(scheme.weights)):
@@ -128,7 +122,8 @@ class RungeKutta:
         )
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
-        """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
+        """Return the mean heat flow in a step of each of `HeatSystem.groups`, (g,), [W], from the stages' `states`. The
+        heat of fixed nodes is what balances their storage and all other flows."""
         system, scheme, fixed = self.system, self._scheme, self.system.fixed
         if not system.groups:
             return np.zeros(0)
@@ -140,7 +135,8 @@ class RungeKutta:
         return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
-        """Return the largest error, [K], from the scheme of the next order; the sum leaves conduction out."""
+        """Return the estimated largest error of a step, [K]: its difference to the scheme `Scheme.estimate`. `inner_w`
+        are the net heat flows into the nodes in each stage, (n,) each, [W]."""
         system, scheme = self.system, self._scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
@@ -172,24 +168,24 @@ def solve_heat(
     estimate_steps: bool = False,
     progress: Progress | None = None,
 ) -> HeatSolution:
-    """Follow the temperatures of a body through time, and account for the heat that each effect brings.
+    """Return the temperatures of a body through time, and the heat that each effect brings.
 
-    Masses are lumped. With backward Euler and tetrahedra without obtuse angles no temperature leaves the range of the
-    start and of the surroundings at any step length, unless a flux or source drives it out. If a temperature leaves
-    this range without such a cause, the status says by how much.
+    Masses are lumped. With backward Euler and tetrahedra without obtuse angles, only a flux or source can drive a
+    temperature out of the range of the start and of the surroundings, at any step length. If a temperature leaves this
+    range without such a cause, the status says by how much.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
-        time: Equal steps, steps as long as a tolerance allows, or the lengths of the steps, shape (k,), [s].
-        scheme: The scheme of equal or given steps. Adaptive steps are always those of SDIRK2.
+        time: Equal steps, adaptive steps, or the lengths of the steps, shape (k,), [s].
+        scheme: The scheme of equal or given steps. Adaptive steps always use SDIRK2.
         relative_tolerance: Relative tolerance of the linear solver in each step.
-        estimate_steps: Estimate the error of equal steps (`time_error_k`), too, by solving again with steps of twice
-            the length, which takes half as long again. Adaptive steps always have an estimate, given steps never.
+        estimate_steps: Also estimate the error of equal steps (`time_error_k`) by a solution with steps twice as long,
+            which takes half as long again. Adaptive steps always have an estimate, given steps never.
         progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Raises:
-        HeatError: An effect does not fit the mesh, a material stores next to no heat, a step's solver does not
-            converge, or the temperature falls below absolute zero.
+        HeatError: An effect does not fit the mesh, a material's heat capacity is below `LEAST_CAPACITY_J_M3K`, a step's
+            solver does not converge, or the temperature falls below absolute zero.
     """
     least = float(np.min(problem.heat_capacity_j_m3k))
     if least < LEAST_CAPACITY_J_M3K:
@@ -228,10 +224,8 @@ def solve_heat(
 
 
 def _given_steps(balance: HeatBalance, kutta: RungeKutta, lengths_s: Vector) -> Iterator[float]:
-    """Add steps of given lengths, [s], to `balance`, and yield after each of them the time that is reached, [s].
-
-    Raises `HeatError` if a step's solver does not converge.
-    """
+    """Add steps of given lengths, [s], to `balance`, and yield the time, [s], at the end of each step. Raises
+    `HeatError` if a step's solver does not converge."""
     relative_k = balance.start_k
     for now_s, step_s in zip(balance.times_s.tolist(), lengths_s.tolist()):
         step = kutta.step(relative_k, now_s, step_s)
@@ -241,9 +235,10 @@ def _given_steps(balance: HeatBalance, kutta: RungeKutta, lengths_s: Vector) -> 
 
 
 def _adaptive_steps(balance: HeatBalance, time: AdaptiveSteps, relative_tolerance: float) -> Iterator[float]:
-    """Add steps as long as their estimated errors and `HeatProblem.resolution_s` allow, and yield as `_given_steps`.
+    """Add adaptive steps to `balance`, and yield the time, [s], at the end of each step.
 
-    Raises `HeatError` if no step is short enough; steps that are repeated are counted in `balance`.
+    Estimated errors and `HeatProblem.resolution_s` limit the lengths. A step that fails is repeated with a shorter
+    length and counted in `balance.repeated`. Raises `HeatError` if no length succeeds.
     """
     system, allowed_k, relative_k = balance.system, STEP_SHARE * time.tolerance_k, balance.start_k
     kutta, now_s = RungeKutta(system, SDIRK2, relative_tolerance), 0.0
@@ -280,20 +275,18 @@ def _adaptive_steps(balance: HeatBalance, time: AdaptiveSteps, relative_toleranc
 
 
 class HeatBalance:
-    """The account of a computation: temperatures at the ends of intervals, and the heat that flowed in between."""
+    """The record of a computation: temperatures at the ends of intervals, and the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, times_s: Vector) -> None:
-        """Begin the account of what happens between `times_s`, ascending from 0, shape (s + 1,), [s]."""
+        """Start an empty record; `times_s`, (s + 1,), [s], ascending from 0, are the ends of the s intervals."""
         self.system, self.times_s = system, times_s
         self._states = np.empty((len(times_s), system.num_nodes))
         self._states[0] = system.start_k
         if len(system.fixed.nodes):
             self._states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
         self._done = 0
-        self.steps = 0
-        """Number of steps that were added so far."""
-        self.repeated = 0
-        """Number of steps that were repeated with a shorter length."""
+        self.steps = 0  # Number of steps that were added so far
+        self.repeated = 0  # Number of steps that failed and were repeated with a shorter length
         self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
         self._exchanged_j = 0.0
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
@@ -302,11 +295,11 @@ class HeatBalance:
 
     @property
     def start_k(self) -> Vector:
-        """Temperatures at the start, nodes of fixed temperature included, relative to the reference, (n,), [K]."""
+        """Initial temperatures minus the reference, (n,), [K]; fixed nodes have their fixed temperature."""
         return self._states[0]
 
     def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
-        """Add a step of length `step_s`, [s], to the account; if it ends an interval, keep its temperatures."""
+        """Add a step of length `step_s`, [s], to the record; keep its temperatures if `ends_interval` is True."""
         refuse_too_cold(self.system, step.relative_k)
         self._heat_j[self._done] += step_s * step.group_heat_w
         self._exchanged_j += step_s * float(np.abs(step.group_heat_w).sum())
@@ -321,7 +314,7 @@ class HeatBalance:
             self._states[self._done] = step.relative_k
 
     def close(self) -> HeatSolution:
-        """Return the solution with its heat; converts the states to Celsius in place, to save memory."""
+        """Return the solution; the record's states become degrees Celsius in place, so nothing can be added after."""
         system, states_k, times_s, heat_j = self.system, self._states, self.times_s, self._heat_j
         mass = system.nodal_mass_j_k
         total_mass = float(mass.sum())
@@ -355,7 +348,7 @@ class HeatBalance:
 
 
 def _fitted(wished_s: float, left_s: float) -> float:
-    """Return the length of the next step, [s]: `left_s`, which ends the interval, or at most half of `left_s`.
+    """Return the length of the next step, [s]: `left_s` if `wished_s` reaches the interval's end, else at most half.
 
     >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
     [10.0, 5.0, 3.0]

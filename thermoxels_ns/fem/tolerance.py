@@ -1,4 +1,4 @@
-"""Solving a heat problem to a tolerance: solve, halve the mesh size, and compare (Richardson)."""
+"""Solution of a heat problem to a tolerance: errors follow from the difference of two solutions (Richardson)."""
 
 from __future__ import annotations
 
@@ -19,34 +19,33 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import Progress, solve_heat
 
 LEAVE_OUT_BELOW = 0.005
-"""Largest share of all heat that the effects left out may bring together: half of the error that building physics
-allows for a heat flow (ISO 10211: 1 %)."""
+"""Default of the largest share of all heat that the effects left out may bring together: half of the error of a heat
+flow that building physics allows (ISO 10211: 1 %)."""
 HALVED = 0.3
-"""Share of an error that is left after the mesh size is halved. Theory says 1/4 where temperatures are
-smooth, and 0.4 at the edges of a notch of a right angle, where temperatures behave as r^(2/3)."""
+"""Share of the error of linear tetrahedra that is left after the mesh size is halved. In theory it is 1/4 for smooth
+temperatures, and 0.4 at the edges of a right-angled notch, at which temperatures behave as r^(2/3)."""
 _LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
-"""Share of an error left after halving, by order of the tetrahedra; for order 2 theory says 1/8, and 0.4 at a notch."""
+"""Share of the error left after halving, by order of the tetrahedra; in theory 1/8 for order 2, and 0.4 at a notch."""
 TO_QUADRATIC = ErrorSize(0.2, 0.1)
 """Error of quadratic tetrahedra as a share of the error of linear ones on the same mesh, for temperatures and for heat
-flows; from smooth to singular temperatures these shares range from 0.02 to 0.5 and from 0.002 to 0.25."""
+flows. From smooth to singular temperatures these shares range from 0.02 to 0.5 and from 0.002 to 0.25."""
 MARGIN = 1.3
-"""Factor by which an error of heat flow may exceed its estimate. The largest of eight bodies is 1.23, where a material
-insulates 1e8 times better than the one beside it along the flow. Temperatures were off by 0.66 to 0.92 of estimates."""
+"""Factor by which the error of a heat flow may exceed its estimate. The largest factor of eight bodies is 1.23, for a
+material that insulates 1e8 times better than its neighbour along the flow. For temperatures it was 0.66 to 0.92."""
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
-"""Relative tolerances of the linear solver for steady states and for steps: its error is far below any estimate."""
+"""Relative tolerances of the linear solver for steady states and for steps; its error is far below any estimate."""
 _FINER_STEPS, _LEFT_BY_STEPS, _STEPS_SHARE = 0.25, 0.4, 0.5
-"""Tolerance of the steps that tell the error of others, as a share of theirs; the share of the error that these leave
-(0.25^(2/3): errors of single steps, of third order, add up in a body that does not forget them; else 0.25); most of the
-allowed error that steps may make."""
+"""Tolerance of the finer steps of an estimate as a share of the tolerance of the coarser; share of the error that finer
+steps leave (0.25^(2/3) if errors of single steps, of third order, add up; else 0.25); allowed share of all error."""
 _NONE = ErrorSize(0.0, 0.0)
-_MOST_TRIES = 6  # Tolerances of steps that are tried; a larger error than allowed then counts as what it is
+_MOST_TRIES = 6  # Number of step tolerances that are tried; after the last, a larger error than allowed is accepted
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
-"""Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
+"""Peak memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
 
 
 @record(HeatError)
 class Goals:
-    """The errors and the memory that a solution may have; raises `HeatError` if numbers are out of range or clash."""
+    """The largest errors and memory that a solution may have; raises `HeatError` if they are out of range or clash."""
 
     tolerance_k: Positive | None = None  # Largest allowed error of any temperature, [K]; None: any error
     flow_tolerance: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
@@ -79,7 +78,8 @@ class Goals:
         return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def excess(self, error: ErrorSize) -> float:
-        """Return the larger ratio of an error, that of heat flow times `MARGIN`, to its allowed value; met up to 1."""
+        """Return the larger ratio of an error to its allowed value, at most 1 if the goals are met. The error of heat
+        flow is multiplied by `MARGIN`. At least one error must be limited (`estimated`)."""
         pairs = (error.temperature_k, self.tolerance_k), (MARGIN * error.heat_flow, self.flow_tolerance)
         return max(found / allowed for found, allowed in pairs if allowed is not None)
 
@@ -92,11 +92,11 @@ class Goals:
 
 @dataclass(frozen=True)
 class Level:
-    """One of the solutions that `solve_to_tolerance` computes: its mesh, steps and estimated errors."""
+    """The mesh, steps and estimated errors of one of the solutions that `solve_to_tolerance` computes."""
 
     order: int  # 1 for linear tetrahedra, 2 for quadratic ones
-    refinements: int  # How often the size of the given mesh was halved
-    step_tolerance_k: float | None  # Error that the time steps are estimated to make, [K]; None for a steady state
+    refinements: int  # Number of times that the size of the given mesh was halved
+    step_tolerance_k: float | None  # Estimated error due to time steps, [K]; None for a steady state
     num_nodes: int  # Number of unknowns
     error: ErrorSize  # Estimated errors
     seconds: float  # Time to solve it, [s]
@@ -116,7 +116,7 @@ class ToleratedSolution:
     """A solution with estimates of its errors; the outcome of `solve_to_tolerance`."""
 
     solution: Solution  # Temperatures and heat flows; nodes of the given mesh come first
-    problem: HeatProblem  # The problem that was solved: the given problem, or the same on a finer mesh
+    problem: HeatProblem  # The problem that was solved: the given problem, perhaps on a finer mesh
     goals: Goals  # Errors that were allowed
     settings: Level  # Order, refinements and steps of `solution`, and its estimated errors
     met: bool  # True if the estimated errors are within the tolerance
@@ -133,23 +133,23 @@ def solve_to_tolerance(
     log: Callable[[str], None] = print,
     progress: Progress | None = None,
 ) -> ToleratedSolution:
-    """Solve a problem on a mesh and in time steps so fine that the estimated errors meet `goals`.
+    """Return a solution on a mesh and in time steps that are fine enough for the estimated errors to meet `goals`.
 
-    The difference of two solutions tells the errors of both, because the error of the finer solution is a known share
-    of the error of the coarser one (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
+    Both errors of two solutions follow from their difference, because the error of the finer solution is a known share
+    of the error of the coarser one (Richardson 1911): `TO_QUADRATIC` or `_LEFT`.
 
-    A steady state is solved with linear and then with quadratic tetrahedra on the given mesh; while the error is too
-    large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. Through time
-    tetrahedra stay linear and the second solution is on a mesh of half the size. Steps are those whose error on the
-    given mesh, found by finer steps, is at most half of what is allowed. The area that flat facets miss of a round
-    body is not estimated.
+    A steady state is solved with linear and then with quadratic tetrahedra on the given mesh. Through time, linear
+    tetrahedra of the given mesh and of half its size are used. While the error is too large, the mesh size is halved
+    again; if the solver fails on quadratic tetrahedra of the given mesh, linear ones follow. Time steps are chosen on
+    the given mesh so that their error, found by finer steps, is at most half of the allowed error. The error of area
+    of flat facets on a round body is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
-        goals: Allowed errors, one at least, and memory.
+        goals: Allowed errors (at least one) and memory.
         time: Duration, and the times at which temperatures are kept and compared; None: the steady state.
         log: Called with a line on each solution and a line on the outcome; print by default.
-        progress: Called in each solution through time as `progress` of `solve_heat`.
+        progress: The argument of `solve_heat`, for each solution through time.
 
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
@@ -157,7 +157,7 @@ def solve_to_tolerance(
     solved, begin_s = list[tuple[Level, HeatProblem, Solution]](), clock.perf_counter()
 
     def lacks_memory(order: int, refinements: int) -> str:
-        """Return why a solution with the mesh size halved `refinements` times does not fit in memory, "" if it does."""
+        """Return why a solution with the mesh size halved `refinements` times does not fit in memory; "" if it fits."""
         times = 1 if time is None else len(time.times_s)
         needed = peak_bytes(problem, order=order, refinements=refinements, times=times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
@@ -172,7 +172,7 @@ def solve_to_tolerance(
         return what
 
     def keep(problem: HeatProblem, solution: Solution, refinements: int, error: ErrorSize, seconds: float) -> None:
-        """Put a solution whose mesh makes an `error` into `solved`."""
+        """Append a solution to `solved`; `error` is due to its mesh, the error of the steps is added."""
         edges, steps_k = 0, None
         if isinstance(solution, SteadySolution):
             edges = len(solution.edge_temperature_c)
@@ -244,7 +244,8 @@ def solve_to_tolerance(
 def _in_good_steps(
     problem: HeatProblem, time: TimeSteps | AdaptiveSteps, goals: Goals, progress: Progress | None
 ) -> tuple[HeatSolution, AdaptiveSteps, ErrorSize]:
-    """Return a solution in steps whose error is small enough, the steps, and their error, which finer steps tell."""
+    """Return a solution in steps whose error is at most `_STEPS_SHARE` of the goals, the steps, and their error. The
+    error is estimated by finer steps. It may be larger after `_MOST_TRIES`."""
     steps = AdaptiveSteps(time.duration_s, outputs=len(time.times_s) - 1)
     steps = steps if goals.tolerance_k is None else replace(steps, tolerance_k=goals.tolerance_k)
     found = solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
@@ -260,7 +261,7 @@ def _in_good_steps(
 
 
 def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
-    """Estimate the errors of a steady solution of linear tetrahedra by solving with quadratic ones on the same mesh.
+    """Return estimated errors of a steady solution of linear tetrahedra, from quadratic ones on the same mesh.
 
     Raises `HeatError` if the solution with quadratic tetrahedra fails.
     """
@@ -270,7 +271,7 @@ def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
 
 
 def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]:
-    """Estimate the errors of a coarser and of a finer solution from their difference `apart`.
+    """Return estimated errors of a coarser and of a finer solution from their difference `apart`.
 
     If the finer error is `left` times the coarser error, the solutions differ by (1 - left) times the coarser error.
 
@@ -282,7 +283,7 @@ def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]
 
 
 def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
-    """Return the largest differences between two solutions with equal times and the same first `num_nodes` nodes."""
+    """Return the largest differences between two solutions; they must share times and their first `num_nodes` nodes."""
     apart_k = np.abs(fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes])
     before_w, after_w = mean_flows_w(coarse), mean_flows_w(fine)
     largest_w = max((abs(after_w[effect] - before_w[effect]) for effect in after_w), default=0.0)
@@ -290,10 +291,9 @@ def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> Erro
 
 
 def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1) -> float:
-    """Return a forecast of the most memory that a solution takes besides the problem itself, [bytes].
+    """Return a forecast of the peak memory of a solution, [bytes], besides the problem itself.
 
-    Each of the `refinements` makes eight tetrahedra of one; `times` is the number of times whose temperatures are kept.
-    Interpreter and libraries take about 150 MB more.
+    The mesh size is halved `refinements` times; `times` states are kept. Libraries take about 150 MB more.
     """
     mesh = problem.mesh
     volume = _BYTES_PER_TET[order] * len(mesh.tets) + 8.0 * times * len(mesh.points_m)
@@ -310,7 +310,7 @@ def describe_bytes(amount: float) -> str:
 
 
 def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:
-    """Return the problem on a mesh of half the size; it starts from `start`, or if None from its own start."""
+    """Return the problem on a mesh of half the size with initial temperatures from `start`; None: from the problem."""
     nodal, edges = (problem.start_c if start is None else start.temperature_c), getattr(start, "edge_temperature_c", ())
     mesh = refine_mesh(replace(problem.mesh, temperature_c=nodal))
     start_c = np.concatenate([nodal, edges]) if len(edges) else mesh.temperature_c

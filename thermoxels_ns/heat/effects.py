@@ -1,4 +1,4 @@
-"""Effects that a scene may name: convection, radiation, sunlight, sources and others; n is the outward normal."""
+"""Effects that a scene may name, such as convection and sunlight; n is the outward normal, k the conductivity."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thermoxels_ns.core.yaml_records import record
 from thermoxels_ns.fem.problem import Effect, Quantity, Varying
 
 HOTTEST_C = 10_000.0
-"""Highest temperature that is accepted, [degrees Celsius]; above it a unit is wrong: the sun's surface has 5500."""
+"""Highest accepted temperature, [degrees Celsius]; a higher one is a wrong unit, as the sun's surface has 5500."""
 
 Celsius: TypeAlias = Annotated[float, Field(ge=-ZERO_CELSIUS_K, le=HOTTEST_C)]
 AtLeastZero: TypeAlias = Annotated[float, Field(ge=0.0)]
@@ -23,11 +23,10 @@ Names: TypeAlias = Annotated[tuple[Annotated[str, Field(pattern=r"\S")], ...], F
 
 @record(HeatError)
 class SurfaceEffect(Effect):
-    """An effect on patches of the boundary.
+    """An effect on patches of the boundary; heat flux is positive into the body, temperatures are in degrees Celsius.
 
-    In all effects temperatures are in degrees Celsius, and a positive heat flux goes into the body. A quantity is a
-    number or a `Varying`, which is evaluated at centroids of boundary triangles (fixed temperatures: at nodes;
-    sources: at points in tetrahedra).
+    A quantity is a number or a `Varying`, which is evaluated at centroids of boundary triangles (fixed temperatures: at
+    nodes; sources: at points in tetrahedra).
     """
 
     patches: Names  # Names of boundary patches, or patterns such as exterior-*; * is the whole boundary
@@ -37,7 +36,7 @@ class SurfaceEffect(Effect):
 class FixedTemperature(SurfaceEffect):
     """A surface that is kept at a given temperature: T = `temperature_c` at its nodes."""
 
-    temperature_c: Celsius | Varying  # Temperature of the surface, [degrees Celsius], at least -273.15; at nodes
+    temperature_c: Celsius | Varying  # Temperature of the surface's nodes, [degrees Celsius], at least -273.15
 
     kind = "fixed temperature"
     form = "fixed"
@@ -72,10 +71,10 @@ class Radiation(SurfaceEffect):
     """
 
     emissivity: Fraction | Varying
-    """Emissivity of the surface, times the view factor of the surroundings if they do not fill its view; 0 to 1."""
+    """Emissivity of the surface, multiplied by the view factor if the surroundings do not fill its view; 0 to 1."""
     surroundings_c: Celsius | Varying  # Radiant temperature of the surroundings, [degrees Celsius], at least -273.15
     stefan_boltzmann_w_m2k4: AboveZero = STEFAN_BOLTZMANN_W_M2K4
-    """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is CODATA 2018's. Published benchmarks use 5.67e-8."""
+    """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is from CODATA 2018. Published benchmarks use 5.67e-8."""
 
     kind = "radiation"
     form = "radiation"
@@ -104,16 +103,16 @@ class GroundContact(SurfaceEffect):
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """1 / R and the temperature of the ground."""
+        """The coefficient 1 / R, [W / (m2 K)], and the temperature of the ground."""
         return 1.0 / self.resistance_m2k_w, self.ground_c
 
 
 @record(HeatError)
 class InternalHeat(Effect):
-    """Heat that is set free inside the body, the source s = `source_w_m3` in rho c dT/dt = div(k grad T) + s."""
+    """Heat that is released inside the body, the source s = `source_w_m3` in rho c dT/dt = div(k grad T) + s."""
 
     regions: Names  # Names of regions, or patterns; * is the whole body
-    source_w_m3: float | Varying  # Heat set free per volume, [W / m3]; a negative value takes heat out
+    source_w_m3: float | Varying  # Heat released per volume, [W / m3]; a negative value takes heat out
 
     kind = "internal heat"
     form = "source"

@@ -13,13 +13,13 @@ from thermoxels_ns.fem.problem import Material, Text
 
 @record(HeatError)
 class MaterialRow(Material):
-    """A row of the table of building materials: design values for conditions in buildings, and their source."""
+    """A row of the table of building materials: design values for use in buildings, and their source."""
 
     source: Text  # Publication from which the values are taken
 
 
 def with_names(content: Any) -> Any:
-    """Return a mapping of materials, read from a file, with each key put into its entry as `name`; else `content`."""
+    """Return a mapping of materials with each key copied into its entry as `name`; return other content unchanged."""
     if not isinstance(content, dict):
         return content
     return {key: {**entry, "name": key} if isinstance(entry, dict) else entry for key, entry in content.items()}
@@ -33,7 +33,7 @@ def material_table() -> dict[str, MaterialRow]:
 
 
 def material(name: str) -> Material:
-    """Look up a building material by its name in the table; raises `HeatError` if there is no such row.
+    """Return the building material of this name from the table; raise `HeatError` if the table lacks it.
 
     >>> material("mineral-wool").conductivity_w_mk
     0.035

@@ -1,4 +1,4 @@
-"""Results of a solution: heat flows by patch, effect, region and wall, hottest and coldest spots, energy balance."""
+"""Results of a solution: heat by patch, effect, region and wall, hottest and coldest spots, energy balance."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class EffectResult:
 
 @dataclass(frozen=True)
 class RegionResult:
-    """The results in one region of the volume; heat flow and temperatures are those at the end."""
+    """The results in one region of the volume; heat flow and temperatures are values at the end."""
 
     region: str  # Name of the region
     material: str  # Name of its material
     volume_m3: float  # Volume, [m3]
-    area_m2: float  # True area of the boundary triangles of the region, [m2], without its contact with other regions
+    area_m2: float  # Area of the boundary triangles of the region, [m2], without its contact with other regions
     heat_w: float  # Heat flow into the body through these triangles, [W]; negative if heat is lost
     heat_w_m2: float  # `heat_w` per area, [W / m2]; 0 without area
     mean_c: float  # Mean temperature over the volume, [degrees Celsius]
@@ -84,17 +84,15 @@ class EnergyBalance:
     into_body: float  # Heat that flows in, summed over intervals and over the patches or regions of all effects
     out_of_body: float  # Heat that flows out, summed in the same way, at least 0
     stored: float  # Change of the body's heat content; 0 in a steady state
-    residual: float  # stored - into_body + out_of_body: stored heat that no heat flow accounts for
-    relative_residual: float
-    """The residual as a ratio, from the solver: `energy_residual` of `HeatSolution` or of `SteadySolution`."""
+    residual: float  # stored - into_body + out_of_body: stored heat without a heat flow as its cause
+    relative_residual: float  # The field `energy_residual` of `HeatSolution` or `SteadySolution`, a ratio
     unbalanced_w: float
-    """Heat that the solver left unbalanced at all nodes, round-off included, [W], through time in the worst step. No
-    heat flow is more uncertain than this."""
+    """Unbalanced heat of all nodes (in the worst step), plus round-off, [W]; it bounds the error of each heat flow."""
 
 
 @dataclass(frozen=True)
 class HeatResults:
-    """The results of a solution that people ask for; heat flows are positive into the body."""
+    """The results of a solution for users; heat flows are positive into the body."""
 
     status: str  # Sentences on how the solver converged
     times_s: tuple[float, ...]  # Times of the kept temperatures, [s]; 0 alone for a steady state
@@ -102,14 +100,13 @@ class HeatResults:
     effects: tuple[EffectResult, ...]
     regions: tuple[RegionResult, ...]
     balance: EnergyBalance
-    overshoot_k: float
-    """Most by which a temperature left the range of the surroundings and the start, [K]; 0 if at most 0.01 K."""
+    overshoot_k: float  # The field `overshoot_k` of the solution, [K]
     coldest: Spot  # Coldest of all nodes and times
     hottest: Spot  # Hottest of all nodes and times
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Return the results of a solution of `problem`; if `nodes` is None, `solution_nodes` makes it."""
+    """Return the results of a solution of `problem`; `nodes` is the result of `solution_nodes`, computed if None."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -132,13 +129,13 @@ def region_behind_facets(mesh: TetMesh) -> IntArray:
 
 
 def volume_shares(mesh: TetMesh) -> FloatArray:
-    """Return each node's share of the volume, shape (n,), with sum 1: a quarter of each tetrahedron around it."""
+    """Return each node's share of the body's volume, (n,), with sum 1; a tetrahedron is shared equally by its nodes."""
     weights = lumped_mass(mesh.points_m, mesh.tets, np.ones(len(mesh.tets)))
     return weights / weights.sum()
 
 
 def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> Spot:
-    """Return the spot of a node at index `time` of `SolutionNodes.times_s`; -1 is the end."""
+    """Return the spot of the node number `node` at index `time` of `SolutionNodes.times_s`; -1 is the end."""
     touching = np.any(selection.mesh.facets == node, axis=1)
     patches = tuple(selection.patch_names[number] for number in np.unique(selection.facet_patch[touching]))
     x, y, z = selection.mesh.points_m[node].tolist()
@@ -245,7 +242,7 @@ def _balance(solution: Solution, lengths: FloatArray) -> EnergyBalance:
     )
 
 
-_LEAST_DIFFERENCE_K = 1e-6  # Difference between the two airs below which there is no wall, [K]
+_LEAST_DIFFERENCE_K = 1e-6  # Least difference between the temperatures of two airs for a U-value, [K]
 
 
 @dataclass(frozen=True)
@@ -255,25 +252,25 @@ class WallPart:
     name: str  # Name of the patch or region
     area_m2: float  # Area of the part, [m2]
     heat_w: float  # Heat flow into the part from the inside, [W]
-    u_value_w_m2k: float  # Heat flow per area and per difference between the temperatures of the airs, [W / (m2 K)]
+    u_value_w_m2k: float  # Heat flow divided by the area and by the temperature difference of the airs, [W / (m2 K)]
 
 
 @dataclass(frozen=True)
 class WallResult:
-    """Figures of a body that parts the air inside from the air outside, as a wall does, in a steady state."""
+    """Figures of a body that separates the air inside from the air outside, as a wall does, in a steady state."""
 
     inside_c: float  # Temperature of the air inside, [degrees Celsius]
     outside_c: float  # Temperature of the air outside, [degrees Celsius]
     area_m2: float  # Area of the inner surface, [m2]
     heat_w: float  # Heat flow into the inner surface, [W]
-    coupling_w_k: float  # Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]
+    coupling_w_k: float  # Thermal coupling coefficient L_3D, heat flow per kelvin between the airs (ISO 10211), [W / K]
     u_value_w_m2k: float
-    """`coupling_w_k` per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); with
-    corners and thermal bridges the value is a mean that depends on which surface is measured."""
+    """`coupling_w_k` per area of the inner surface, [W / (m2 K)]. For a plane wall this is the U-value (ISO 6946). With
+    corners and thermal bridges the value is a mean, which depends on the surface that is measured."""
     temperature_factor: float
-    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at `coldest`: 1 is as warm as the air inside. The factor depends on the
-    resistance of the inner surface. For the risk of mould ISO 13788 asks for 0.25 m2 K/W, a coefficient of 4 W/(m2 K);
-    ISO 6946 takes 0.10 to 0.17 m2 K/W for the loss of heat."""
+    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at `coldest`; it is 1 at the temperature of the air inside. The factor
+    depends on the resistance of the inner surface. For the risk of mould ISO 13788 asks for 0.25 m2 K/W, a coefficient
+    of 4 W/(m2 K); ISO 6946 uses 0.10 to 0.17 m2 K/W for the loss of heat."""
     coldest: Spot  # Coldest node of the inner surface; the hottest if it is warmer outside
     patches: tuple[WallPart, ...]  # Parts of the inner surface by patch
     regions: tuple[WallPart, ...]  # Parts of the inner surface by region
@@ -282,10 +279,10 @@ class WallResult:
 def wall_of_scene(
     scene: HeatScene, problem: HeatProblem, solution: Solution, nodes: SolutionNodes, *, doubtful: bool
 ) -> WallResult | str:
-    """Return the `wall_result` of a body in a steady state between two airs; else a sentence on why there is none.
+    """Return the `wall_result` of a body in a steady state between two airs, or a sentence on why there is no result.
 
-    The sentence is empty through time, without two airs, or if both airs have the same temperature. `doubtful` is True
-    if the airs probably act on other surfaces than was meant; then there is no result.
+    The sentence is empty through time, without two airs, or if both airs have the same temperature. There is no result
+    if `doubtful` is True: the airs then probably act on surfaces that the user did not mean.
     """
     inside, outside = scene.inside_air, scene.outside_air
     if not isinstance(solution, SteadySolution) or inside is None or outside is None:
@@ -310,10 +307,11 @@ def wall_result(
     outside_c: float,
     nodes: SolutionNodes | None = None,
 ) -> WallResult:
-    """Return the heat flow, U-value and coldest spot of a body between two airs.
+    """Return the heat flow, U-value and coldest spot of a body between airs of two different temperatures.
 
-    These are figures of a wall only if nothing but the two airs acts: sunlight or a cold sky would count as heat
-    through the wall. `inside` names the patches, of area above 0, that face the air inside; both airs differ.
+    The figures describe a wall only if the two airs are the only effects, because heat from sunlight or to a cold sky
+    would be counted as heat through the wall. `inside` are names or patterns of the patches that face the air inside;
+    their area must be above 0. `nodes` is `solution_nodes(problem, solution)`, computed if None.
     """
     difference_k = inside_c - outside_c
     selection, mesh = problem.selection, problem.mesh

@@ -1,4 +1,4 @@
-"""A heat run: a scene is put on a mesh and solved, with probes, warnings and results."""
+"""A heat run: solution of a scene on a mesh, with probes, warnings and results."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 _OUTSIDE = 1e-9
-"""Distance outside a tetrahedron, as a share of its height, up to which a point counts as on its face."""
+"""Largest distance of a point outside a tetrahedron, as a share of its height, at which it counts as on the face."""
 
 
 def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> sparse.csr_matrix:
-    """Return the matrix, (p, n), that interpolates nodal values at points, shape (p, 3), [m].
+    """Return the matrix (p, n) that interpolates nodal values at the points (p, 3), [m].
 
-    Each row has the barycentric coordinates of a point in its tetrahedron, which are at least 0 and have the sum 1.
-    Raises `HeatError` if a point lies outside the body.
+    A row holds the barycentric coordinates of a point in its tetrahedron; they are at least 0 and sum to 1. Raises
+    `HeatError` if a point lies outside the body.
 
     >>> corner, none = np.vstack([np.zeros(3), np.eye(3)]), np.zeros((0, 3), np.int64)
     >>> tets, seen = np.array([[0, 1, 2, 3]]), np.ones(4, bool)
@@ -85,9 +85,7 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> sparse.csr_matrix:
 
 @dataclass(frozen=True)
 class HeatRun(HasTables):
-    """The outcome of `run_scene`: the problems, the solution, its results and the warnings.
-
-    It has the tables "patches", "effects", "regions" and "times"."""
+    """The outcome of `run_scene`: the problems, the solution, its results, the warnings, and tables of them."""
 
     scene: HeatScene  # The scene that was run
     problem: HeatProblem  # The problem with all effects of the scene, on the given mesh
@@ -96,17 +94,17 @@ class HeatRun(HasTables):
     left_out: tuple[LeftOut, ...]  # Effects that were left out because they bring too little heat
     accuracy: ToleratedSolution | None  # Solution with estimated errors; None if no tolerance was given
     warnings: tuple[str, ...]  # Sentences on what looks wrong about the scene on this mesh
-    unfit: tuple[str, ...]  # Those of `warnings` that make heat losses and U-values worthless: the mesh has no rooms
-    layers: tuple[Layer, ...]  # Layers that `behind_m2k_w` asked for
+    unfit: tuple[str, ...]  # Entries of `warnings` that make heat losses and U-values worthless, such as no rooms
+    layers: tuple[Layer, ...]  # Layers that `with_layers` added for `behind_m2k_w`
     solution: Solution  # Temperatures and heat flows
     results: HeatResults  # Heat by patch, effect and region, the heat balance, and the coldest and hottest spot
     wall: WallResult | None
-    """U-value and f_Rsi of the body between two airs in a steady state; None without airs, or if `no_wall` says why."""
-    no_wall: str  # Sentence on why a steady state between two unlike airs gave no `wall`; else empty
+    """U-value and f_Rsi of the body between two airs in a steady state; None if there is no such result."""
+    no_wall: str  # Sentence on why a steady state between airs of two temperatures gave no `wall`; else empty
     mean_c: FloatArray  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
-    probes_m: FloatArray  # Points where temperatures are followed, shape (p, 3), [m]
+    probes_m: FloatArray  # Points at which temperatures are recorded, shape (p, 3), [m]
     probes_c: FloatArray  # Temperatures at `probes_m`, shape (s, p), [degrees Celsius]
-    seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
+    seconds: Mapping[str, float]  # Time to solve, "solve", and to work out the results, "answers", [s]
 
     def __repr__(self) -> str:
         states, last_s = self.nodes.states_c, self.nodes.times_s[-1]
@@ -115,10 +113,10 @@ class HeatRun(HasTables):
         return f"HeatRun({what}, {states[-1].min():.4g} to {states[-1].max():.4g} °C at the end{wall})"
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return heat and temperatures by patch, effect and region, and through time, see `HeatResults`.
+        """Return the tables "patches", "effects" and "regions" of `HeatResults`, and "times".
 
-        "times" has a line for each kept time: the least, mean and largest temperature, those at probes, and the mean
-        heat flow into the body by each effect since the time before, which the start has none of."""
+        "times" has a line for each kept time: the least, mean and largest temperature, temperatures at probes, and the
+        mean heat flow into the body by each effect since the previous time (None at the start)."""
         states, effects = self.nodes.states_c, self.solution.effects
         times = list[dict[str, Any]]()
         for number, time_s in enumerate(self.nodes.times_s.tolist()):
@@ -132,7 +130,7 @@ class HeatRun(HasTables):
         return {**of_results, "times": times}
 
     def to_pyvista(self) -> pv.MultiBlock:
-        """Return the mesh that was solved, with the temperatures at the end, as `thermoxels_ns.to_pyvista` does."""
+        """Return the blocks of `blocks_of` for the mesh that was solved, with the temperatures at the end."""
         end = replace(self.nodes.mesh, temperature_c=self.nodes.states_c[-1])
         return blocks_of(end, {"up": self.problem.up})
 
@@ -148,12 +146,12 @@ def run_scene(
     behind_m2k_w: Mapping[str, float] | None = None,
     say: Say = lambda _: None,
 ) -> HeatRun:
-    """Put a scene on a mesh, solve the problem, and return the solution with results and warnings.
+    """Return the solution of a scene on a mesh, with results and warnings.
 
-    If the scene has no `up`, the argument `up` counts, or z if it is None. Temperatures are followed at `probes_m`,
-    shape (p, 3), [m]. `export`, the summary of the export that wrote the mesh, adds warnings; `say` gets lines of
-    progress. `behind_m2k_w` is the argument of `with_layers`. Raises `HeatError` if the scene does not fit the mesh, a
-    probe lies outside it, or the solver fails.
+    `goals` are the allowed errors and memory. The direction `up` is used if the scene has none; None: z. Temperatures
+    are recorded at `probes_m`, shape (p, 3), [m]. `export`, the summary of the export that wrote the mesh, adds
+    warnings. `behind_m2k_w` is the argument of `with_layers`; None: no layers. `say` is called with lines of progress.
+    Raises `HeatError` if the scene does not fit the mesh, a probe lies outside it, or the solver fails.
     """
     start, scene = clock.perf_counter(), scene.on(mesh)
     scene, layers = (scene, ()) if behind_m2k_w is None else with_layers(scene, mesh, behind_m2k_w, up)
@@ -209,31 +207,29 @@ def run_scene(
 
 
 def mesh_error_in_words(solution: Solution) -> str:
-    """Return in words the estimated mesh error of a solution without tolerance, or that there is no estimate."""
+    """Return a phrase on the estimated mesh error of a solution without tolerance, or on the lack of an estimate."""
     error = solution.error if isinstance(solution, SteadySolution) else None
     if error is None:
         return "not estimated; --flow-tolerance 0.01 or --tolerance 0.05 estimates it"
     return f"estimated {error.describe()}, usually right to a factor of three"
 
 
-_KELVIN_OF_AIR = (173.15, 373.15)  # Temperatures of air that are likely in kelvin and hardly so in degrees Celsius
+_KELVIN_OF_AIR = (173.15, 373.15)  # Range of numbers that are likely air temperatures in kelvin, but not in Celsius
 _COS_45 = float(np.sqrt(0.5))
-_LEAST_OF_A_ROOM = 0.1
-"""Least share of a room's inner surface that walls and floor make up; in a cube they make up five sixths."""
-_LEAST_FLOOR = 0.5  # Least area of a room's floor over that of its ceiling
-_MOST_SHARED = 0.02  # Share of the inner surface's nodes that may lie on the outer one, as the rim of a hole does
-_THICKNESS_OFF = 0.2  # Relative difference from the asked thickness of walls above which there is a warning
+_LEAST_OF_A_ROOM = 0.1  # Least share of walls and floor in a room's inner surface; in a cube they are five sixths of it
+_LEAST_FLOOR = 0.5  # Least ratio of a room's floor area to its ceiling area
+_MOST_SHARED = 0.02  # Largest share of the inner surface's nodes that may lie on the outer one, as rims of holes do
+_THICKNESS_OFF = 0.2  # Largest relative difference from the asked thickness of walls without a warning
 _INWARDS = -0.2
-"""Value of `_outwards` below which a surface faces inwards, as that of a room does. Typical values: 0.8 to 1 for a body
-seen from around, 0 for a plane, -0.8 to -1 for a room seen from within."""
+"""Value of `_outwards` below which a surface faces inwards, as in a room. Typical values: 0.8 to 1 for a body seen from
+around, 0 for a plane, -0.8 to -1 for a room seen from within."""
 
 
 def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
     """Return warnings if the default patches of the scene's two airs do not suit the mesh.
 
-    By default, surfaces that no camera saw are inside. This is wrong for a body that was filled, of which only the
-    underside is unseen, and for a room that was photographed from within, whose inner surface was seen. Airs whose
-    patches the scene names are not checked.
+    By default, surfaces that no camera saw are inside. This is wrong for a filled body, of which only the underside is
+    unseen, and for a room photographed from within. Airs for which the scene names patches are not checked.
     """
     selection = Selection(mesh, up)
     inside_air = scene.inside_air if scene.inside_air and scene.inside_air.patches[:1] == INSIDE else None
@@ -261,9 +257,9 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return warnings on a missing floor and on nodes that the inner surface shares with the outer one.
+    """Return two tuples of warnings: on faults that make heat losses worthless, and on harmless faults.
 
-    The first ones make heat losses worthless; the second ones, on a few nodes at rims of holes, do not.
+    A missing floor and nodes that inner and outer surface share are faults; few shared nodes (rims) are harmless.
     """
     if scene.inside_air is None or scene.outside_air is None:
         return (), ()
@@ -294,23 +290,24 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer on the outside of a patch, with which heat meets the resistance that an audit found."""
+    """A thermal layer on the outside of a patch that raises the resistance of the wall to what an audit found."""
 
     patch: str
-    asked_m2k_w: float  # Resistance from the air inside to the outer surface, [m2 K / W]
-    body_m2k_w: float  # That of the body and of the air inside, without a layer, [m2 K / W]
-    layer_m2k_w: float  # What the layer adds, at least 0, [m2 K / W]
+    asked_m2k_w: float  # Wanted resistance from the air inside to the outer surface, [m2 K / W]
+    body_m2k_w: float  # Resistance of the inner film and the body without the layer, [m2 K / W]
+    layer_m2k_w: float  # Resistance of the layer, at least 0, [m2 K / W]
 
 
 def with_layers(
     scene: HeatScene, mesh: TetMesh, behind_m2k_w: Mapping[str, float], up: Direction | None = None
 ) -> tuple[HeatScene, tuple[Layer, ...]]:
-    """Return a scene with a layer on the outside of each patch, so that a wall has a given resistance.
+    """Return a scene with a thermal layer on the outside of patches, so that walls have given resistances, and layers.
 
-    If the scene has no `up`, the argument counts, or z. `behind_m2k_w` is the resistance from the air inside to the
-    outer surface, [m2 K / W], by patch. The body's own is its thickness, the distance across the wall between an outer
-    and the nearest inner triangle, by its conductivity.
-    Raises `HeatError` if the body has no rooms, or if more than air acts, because no layer lies below sunlight or sky.
+    `behind_m2k_w` is the wanted resistance from the air inside to the outer surface by patch, [m2 K / W]. The layer has
+    what the inner film and the body lack. The body's resistance is its thickness, the distance across the wall from an
+    outer to the nearest inner triangle, divided by its conductivity. `up` is used if the scene has none; None: z.
+    Raises `HeatError` if the body has no rooms or lacks the patches, or if effects other than the two airs act: the
+    layer is part of the outer film, so it cannot lie below sunlight or sky.
     """
     top = np.array(scene.up or up or (0.0, 0.0, 1.0), dtype=np.float64)
     x, y, z = (top / np.linalg.norm(top)).tolist()
@@ -353,7 +350,7 @@ def with_layers(
 
 
 def air_warnings(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on airs that were probably given in kelvin, and on series that do not cover the scene's time."""
+    """Return warnings on air temperatures probably given in kelvin, and on series that leave times uncovered."""
     hours, warnings = scene.time.duration_s / 3600.0 if scene.time else 0.0, list[str]()
     airs = [("inside_air", scene.inside_air), ("outside_air", scene.outside_air)]
     airs += [(f"convection entry {number}", entry) for number, entry in enumerate(scene.convection, start=1)]
@@ -376,7 +373,7 @@ def air_warnings(scene: HeatScene) -> tuple[str, ...]:
 
 
 def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
-    """Return a warning on bodies that overlap, or else on different nodes at one place, between which no heat flows."""
+    """Return a warning if bodies overlap, or else if two nodes are at one place, between which no heat flows."""
     twins, inside, warnings = count_twin_nodes(mesh.points_m), count_tets_in_other_bodies(mesh), []
     if inside:
         warnings.append(
@@ -392,7 +389,7 @@ def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a warning if `export`, the mesh's export summary, tells of a shell of unknown or unwanted thickness."""
+    """Return a warning if the mesh is a shell of unknown or unwanted thickness by `export`, its export summary."""
     options, mesh = export.get("options"), export.get("mesh")
     if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
         return ()
@@ -418,7 +415,8 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
 
 
 def _outwards(selection: Selection, chosen: BoolArray) -> float:
-    """Return the mean cosine between normals and the directions away from the middle of a surface; 0 if it is empty."""
+    """Return the mean cosine between normals and directions away from a surface's middle; 0 for an empty surface. The
+    surface is the triangles `chosen` (f,); the mean is weighted by area."""
     area = selection.facet_area_m2[chosen]
     if not float(area.sum()) > 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""A heat scene: materials, surroundings and time, made in code or read from a yaml file, and its problem on a mesh.
+"""Heat scenes (materials, surroundings and time), made in code or read from yaml files, and their problem on a mesh.
 
 ``configs/scene-all-effects.yaml`` explains every key of a file.
 """
@@ -58,27 +58,27 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 Section = TypeVar("Section", InsideAir | None, OutsideAir | None, Surface, Sun | None, Radiation, AbsorbedSolar)
 Shining = TypeVar("Shining", Radiation, AbsorbedSolar)
 
-DEFAULTS = (INSIDE, OUTSIDE)  # Patches of sections for which the scene names none
+DEFAULTS = (INSIDE, OUTSIDE)  # Default patches of sections
 
 _Z_UP: Vector = (0.0, 0.0, 1.0)
-_ANY_START_C = 10.0  # where the iterations to a steady state start on a mesh without temperatures, [degrees Celsius]
+_ANY_START_C = 10.0  # initial temperature of a steady solver's iterations on a mesh without one, [degrees Celsius]
 _PATCHES_OF_THEIR_OWN = "Give each of the two its own patches: [names]."
 
 
 @record(HeatError)
 class HeatScene:
-    """A heat scene: materials, surroundings and time. Only effects that the scene names are built."""
+    """A heat scene: materials, surroundings and time. Only effects that the scene names act on the body."""
 
     materials: Annotated[Mapping[str, Material], Field(min_length=1)]
     """Materials by name or pattern of the mesh's regions; if several patterns match a region, the last one holds."""
     time: TimeSteps | AdaptiveSteps | None = None
     """Time steps in which the body is followed; None: the steady state is asked for."""
     initial_c: Celsius | None = None
-    """Temperature of the whole body at the start, [degrees Celsius]; None: temperatures of the photographs."""
-    up: Direction | None = None  # Direction that points up in the mesh's coordinates; None: that given to `problem`
+    """Temperature of the whole body at the start, [degrees Celsius]; None: the temperatures of the mesh."""
+    up: Direction | None = None  # Up direction in the mesh's coordinates; None: the argument `up` of `problem`
     inside_air: InsideAir | None = None  # The air of a room
     outside_air: OutsideAir | None = None  # The open air and its wind
-    surfaces: tuple[Surface, ...] = ()  # Emissivity and absorptivity by patches; for one patch the last entry holds
+    surfaces: tuple[Surface, ...] = ()  # Emissivity and absorptivity of patches; the last entry for a patch holds
     sky: Sky | None = None  # The sky that surfaces radiate to
     ground: Ground | None = None  # The ground that surfaces see
     sun: Sun | None = None  # The sun
@@ -86,9 +86,9 @@ class HeatScene:
     heat_flux: tuple[HeatFlux, ...] = ()  # Given heat fluxes, positive into the body
     convection: tuple[Convection, ...] = ()  # Further air, such as a second room, with given coefficients
     radiation: tuple[Radiation, ...] = ()  # Long-wave exchange with surroundings of one temperature
-    absorbed_solar: tuple[AbsorbedSolar, ...] = ()  # Sunlight of given strength, whatever way the surfaces face
+    absorbed_solar: tuple[AbsorbedSolar, ...] = ()  # Sunlight of given strength, for any direction of the surfaces
     ground_contact: tuple[GroundContact, ...] = ()  # Surfaces that touch the ground
-    internal_heat: tuple[InternalHeat, ...] = ()  # Heat set free inside
+    internal_heat: tuple[InternalHeat, ...] = ()  # Heat released inside
     adiabatic: tuple[str, ...] = ("cut",)
     """Patches that no heat crosses, by name or pattern. A patch with area must be named here or have an effect."""
     description: str = ""  # Description of the scene, for reports
@@ -117,14 +117,14 @@ class HeatScene:
 
     @property
     def steady(self) -> bool:
-        """True if the steady state is asked for, `time` being None."""
+        """True if the steady state is asked for, because `time` is None."""
         return self.time is None
 
     def on(self, mesh: TetMesh) -> HeatScene:
-        """Return the scene whose default patches include the mesh's named ones: what photographs show is outside.
+        """Return the scene with the mesh's named patches added to all sections that have default patches.
 
-        A named patch is outside (``exterior-*``) if photographs show most of its area, else inside. Patches that
-        another entry of the scene names are left to that entry.
+        A named patch is added to outside sections (``exterior-*``) if photographs show most of its area, else to inside
+        sections. It is not added if another entry of the scene names it.
         """
         area, tags = Selection(mesh).facet_area_m2, mesh.boundary
         whole, seen = (np.bincount(tags.patch, area * part, len(tags.patch_names)) for part in (1.0, tags.seen))
@@ -156,7 +156,7 @@ class HeatScene:
         )
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Return the problem on a mesh. If the scene has no `up`, the argument counts, or z. Raises as `effects`."""
+        """Return the problem on a mesh; `up` is used if the scene has none (None: z). Raises errors as `effects`."""
         with raising(HeatError):
             mesh.check()
         start_c = self.initial_c
@@ -166,7 +166,7 @@ class HeatScene:
         return HeatProblem(mesh, self.material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
     def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:
-        """Return the effects that the scene names.
+        """Return the effects of the scene on a mesh.
 
         Raises `HeatError` if the mesh lacks a patch that the scene names, a patch has no effect and is not named
         adiabatic, or two entries count the same exchange of heat.
@@ -179,7 +179,7 @@ class HeatScene:
         return (*(effect for _, effect in named), *self.internal_heat)
 
     def _named_effects(self, selection: Selection) -> list[tuple[str, Effect]]:
-        """Return the effects on the surface, each after the name of the scene's entry from which it comes."""
+        """Return pairs of an entry's name in the scene and an effect on the surface that it causes."""
         named: list[tuple[str, Effect]] = []
         if self.inside_air is not None:
             named.append(("inside_air", self.inside_air.convection()))
@@ -195,7 +195,7 @@ class HeatScene:
         return named
 
     def material(self, mesh: TetMesh) -> Material | dict[str, Material]:
-        """Return the material of a mesh, by region if regions differ; a region for which there is none is left out."""
+        """Return the material of a mesh, or a mapping by region if regions differ; it may lack regions."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
             matching = chosen_names("materials", mesh.region_names, (pattern,), "regions")
@@ -233,10 +233,8 @@ class HeatScene:
     def _of_surfaces(
         self, selection: Selection, key: Literal["emissivity", "absorptivity"], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
-        """Group patches by their value of `key` in `surfaces`; return the escaped names of each group and its value.
-
-        Of several entries for a patch the last one holds. `allowed` limits the patches; None: all patches.
-        """
+        """Return groups of patches with one value of `key` in `surfaces`: names, escaped for patterns, and the value.
+        The last entry for a patch holds. Patches that are not in `allowed` are left out; None: all are allowed."""
         chosen: dict[str, float] = {}
         for number, surface in enumerate(self.surfaces, start=1):
             given: float | None = getattr(surface, key)
@@ -249,7 +247,7 @@ class HeatScene:
         return [(tuple(names), number) for number, names in groups.items()]
 
     def _check_none_forgotten(self, area_m2: dict[str, float], acting: set[str]) -> None:
-        """Raise `HeatError` for a patch with area that is neither in `acting` nor adiabatic."""
+        """Raise `HeatError` if a patch with area is neither adiabatic nor in `acting`, the patches with an effect."""
         forgotten = [
             patch
             for patch, area in area_m2.items()
@@ -266,7 +264,8 @@ class HeatScene:
             raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
-        """Raise `HeatError` for two contacts with air or ground, or radiation counted twice, on one patch."""
+        """Raise `HeatError` if a patch has two contacts with air or ground, or if its radiation is counted twice.
+        `where` holds the names of entries and the patches on which they act."""
         airs = {"inside_air": self.inside_air, "outside_air": self.outside_air}
         whole = {name for name, air in airs.items() if air is not None and air.coefficient in WITH_RADIATION}
         if self.sky is not None and self.ground is not None and self.ground.surface_c is not None:
@@ -293,7 +292,7 @@ class HeatScene:
 
 
 def _patches(selection: Selection, name: str, patterns: Sequence[str]) -> set[str]:
-    """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
+    """Return the patches that match a pattern of the entry `name`; raise `HeatError` if a pattern matches none."""
     return chosen_names(f"{name}: patches", selection.patch_names, patterns)
 
 
@@ -306,7 +305,7 @@ _Time = Annotated[Annotated[TimeSteps, Tag("equal")] | Annotated[AdaptiveSteps, 
 
 @cache
 def _file_record() -> type:
-    """Return the record of a file's keys: those of `HeatScene` with the differences that `load_heat_scene` names."""
+    """Return the record class of a file's keys: fields of `HeatScene`, with the differences in `load_heat_scene`."""
     hints = get_type_hints(HeatScene, include_extras=True)
     own = [(one.name, hints[one.name], one) for one in fields(HeatScene)]
     return make_dataclass("Scene", [
@@ -319,16 +318,16 @@ def _file_record() -> type:
 
 
 def heat_scene_names() -> list[str]:
-    """Return the names of the scenes in the package, sorted, which `load_heat_scene` accepts."""
+    """Return the names, sorted, of the package's scenes for `load_heat_scene`."""
     return sorted(path.stem.removeprefix("scene-") for path in configs_folder().glob("scene-*.yaml"))
 
 
 @raising(HeatError)
 def load_heat_scene(name: Path | str | Mapping[str, Any]) -> HeatScene:
-    """Read a heat scene from a yaml file, from the package by a name such as ``winter-night``, or from a mapping.
+    """Return a heat scene from a yaml file, from the package by a name such as ``winter-night``, or from a mapping.
 
-    The keys of a file are the fields of `HeatScene`, with three differences: a material is a name of the table or
-    three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either
+    The keys of a file are the fields of `HeatScene`, with three differences. A material is a name of the table or three
+    figures. The initial temperature is ``initial: photographs`` or ``initial: {temperature_c: 15}``. A scene has either
     ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` if the name
     is not known or the content is wrong.
     """
@@ -365,16 +364,16 @@ _UNIT_OF_KEY = {
     **{"_kg_m3": "kg/m3", "_j_kgk": "J/(kg K)", "_seconds": "s", "_s": "s", "_c": "C", "_k": "K", "_deg": "degrees"},
     **dict.fromkeys(("emissivity", "absorptivity", "reflectance"), "1"),
 }
-"""Unit of a number by the end of its key; the first end that fits counts."""
+"""Unit of a number by the end of its key; the first end that matches holds."""
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit of the number under a key, such as W/m2 for ``flux_w_m2``; None if the key does not tell."""
+    """Return the unit of the number under a key, such as W/m2 for ``flux_w_m2``; None if the key ends in no unit."""
     return next((unit for end, unit in _UNIT_OF_KEY.items() if key.endswith(end)), None)
 
 
 def _without_units(name: str, content: Any) -> Any:
-    """Return the content of a file with texts such as ``20.5 C`` or ``24 h`` as numbers in the units of their keys."""
+    """Return a file's content with texts such as ``20.5 C`` or ``24 h`` converted to numbers in their keys' units."""
     if isinstance(content, list):
         return [_without_units(f"{name} entry {number}", one) for number, one in enumerate(content, start=1)]
     if not isinstance(content, dict):

@@ -40,24 +40,25 @@ OutsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946
 INSIDE_RESISTANCE_M2K_W: Mapping[HeatDirection, float] = MappingProxyType(
     {"up": 0.10, "horizontal": 0.13, "down": 0.17}
 )
-"""Rsi, resistance between a room and its surfaces by the direction of the heat flow, [m2 K / W] (ISO 6946)."""
+"""Rsi, film resistance between a room and its surfaces, by direction of the heat flow, [m2 K / W] (ISO 6946)."""
 OUTSIDE_RESISTANCE_M2K_W = 0.04
-"""Rse, resistance between a surface and the open air, [m2 K / W] (ISO 6946), for all directions."""
+"""Rse, film resistance between a surface and the open air, [m2 K / W] (ISO 6946), for all directions."""
 INSIDE_CONVECTION_W_M2K: Mapping[HeatDirection, float] = MappingProxyType({"up": 5.0, "horizontal": 2.5, "down": 0.7})
-"""hci, coefficient of convection alone in a room by the direction of the heat flow, [W / (m2 K)] (ISO 6946)."""
+"""hci, coefficient of convection alone in a room, by direction of the heat flow, [W / (m2 K)] (ISO 6946)."""
 
-_SUN_RESOLUTION_S = 3600.0  # Resolution of the moving sun, [s]: in this time the sun moves by 15 degrees
-_HORIZONTAL = 0.5 + 1e-9  # Sine of 30 degrees, up to which a heat flow counts as horizontal, with room for round-off
+_SUN_RESOLUTION_S = 3600.0  # `Varying.resolution_s` of the moving sun, [s]: the sun moves by 15 degrees in this time
+_HORIZONTAL = 0.5 + 1e-9  # Largest sine of a heat flow that counts as horizontal: 30 degrees, plus round-off
 
 
 def _by_orientation(table: FloatArray, sign: float, places: Places, _: float) -> FloatArray:
-    """Return values of a table for heat that flows up, horizontally (up to 30 degrees off) and down (ISO 6946)."""
+    """Return the entry of `table` for heat that flows up, horizontally (within 30 degrees) or down, (k,) (ISO 6946).
+    `sign` is 1 if heat flows out of the body at the places, and -1 if it flows in."""
     upward = sign * (places.normals @ np.array(places.up))
     return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
 
 
 def radiative_coefficient(mean_c: float, emissivity: float) -> float:
-    """Return the coefficient of linearised radiation, hr = 4 eps sigma Tm^3, [W / (m2 K)] (ISO 6946).
+    """Return the coefficient of linearised radiation at the temperature Tm, 4 eps sigma Tm^3, [W / (m2 K)] (ISO 6946).
 
     >>> round(radiative_coefficient(10.0, 1.0), 2)
     5.15
@@ -82,21 +83,21 @@ Direction: TypeAlias = Annotated[Vector, AfterValidator(_direction)]
 
 @record(HeatError)
 class _Air:
-    """Air whose temperature is a number, or changes with time as a file says; `HeatError` if the file is unfit."""
+    """Air with a constant temperature or a temperature series from a file; raises `HeatError` if the file is unfit."""
 
     air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
     coefficient: OutsideCoefficient | None = None  # Name of a heat transfer coefficient, see the classes below
     coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
     emissivity: Fraction | None = field(default=None, kw_only=True)
-    """Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone."""
+    """Emissivity of the surfaces, 0 to 1; only iso-6946-separate needs it."""
     air_series: str | None = field(default=None, kw_only=True)
     """A weather file beside the scene: csv with hours (since the start) and outside_c or inside_c among its columns, or
-    .epw. The temperature is interpolated linearly, and constant before the first and after the last line; named
-    coefficients still use the field `air_c`. A sky whose temperature follows the air follows this series, too."""
+    .epw. The temperature is interpolated linearly, and constant before the first and after the last line. Named
+    coefficients still use the field `air_c`. A sky whose temperature follows the air also follows this series."""
     air_start: AwareDatetime | None = field(default=None, kw_only=True)
-    """Date and time of the scene's start, with a time zone, for an .epw file, whose year does not matter."""
+    """Date and time of the scene's start, with a time zone, for an .epw file; the year has no influence."""
 
-    column: ClassVar[str] = "outside_c"  # What the air takes from a weather file
+    column: ClassVar[str] = "outside_c"  # Column of a weather file that holds the air's temperature
 
     def __post_init__(self) -> None:
         epw = self.air_series is not None and self.air_series.lower().endswith(".epw")
@@ -113,7 +114,7 @@ class _Air:
 
     @property
     def temperature(self) -> Quantity:
-        """Temperature of the air, constant or changing with time, [degrees Celsius]."""
+        """Temperature of the air, [degrees Celsius], a number or a function of time."""
         if self.air_series is None:
             return self.air_c
         hours, air_c = self.series()
@@ -126,7 +127,8 @@ class _Air:
         return tabulated(3600.0 * hours, air_c)
 
     def series(self) -> tuple[FloatArray, FloatArray]:
-        """Return hours since the start and temperatures, (k,) each, of `air_series`; `HeatError` if it is unfit."""
+        """Return the hours since the start and the temperatures of `air_series`, (k,) each. Raises `HeatError` if the
+        file cannot be read or lacks the column."""
         assert self.air_series is not None
         with raising(HeatError, "air_series: "):
             found = read_weather(self.air_series, self.air_start, any_year=True)
@@ -146,12 +148,12 @@ class InsideAir(_Air):
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
     iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
     heat_flow: HeatFlow = "into-body"
-    """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
+    """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling. out-of-body:
     the air is colder. Named coefficients depend on this field."""
     patches: Names = INSIDE  # Patches that the air acts on, by name or pattern
 
     def convection(self) -> Convection:
-        """Return the convection between the air of the room and the body."""
+        """Return the effect of convection between the air of the room and the body."""
         if self.coefficient_w_m2k is not None:
             return Convection(self.patches, self.coefficient_w_m2k, self.temperature)
         radiative = radiative_coefficient(self.air_c, self.emissivity or 0.0)
@@ -181,7 +183,7 @@ class OutsideAir(_Air):
         check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
-        """Return the convection between the open air and the body."""
+        """Return the effect of convection between the open air and the body."""
         wind, coefficient = self.wind_m_s or 0.0, self.coefficient_w_m2k
         if self.coefficient == "iso-6946-combined":
             coefficient = 1.0 / OUTSIDE_RESISTANCE_M2K_W
@@ -194,13 +196,13 @@ class OutsideAir(_Air):
 
 @record(HeatError)
 class Surface:
-    """Emissivity of patches, which sky and ground act on, and absorptivity of patches, which the sun acts on."""
+    """Emissivity of patches for radiation to sky and ground, and absorptivity of patches for sunlight."""
 
     emissivity: Fraction | None = None
     """Emissivity for long-wave radiation, 0 to 1; None: the patches exchange no radiation with sky and ground."""
     absorptivity: Fraction | None = None  # Share of the sunlight that the patches absorb, 0 to 1; None: no sunlight
     patches: Names = OUTSIDE
-    """Patches, by name or pattern; if several entries give a property of one patch, the last one holds."""
+    """Patches, by name or pattern; if several entries give a property of one patch, the last entry holds."""
 
     def __post_init__(self) -> None:
         if self.emissivity is None and self.absorptivity is None:
@@ -236,9 +238,9 @@ class Ground:
 
 @record(HeatError)
 class Sun:
-    """Sunlight: the sun moves from `start` or stands still at `towards`; its strength is given or that of a clear sky.
+    """Sunlight of a sun that moves from `start` on, or that is fixed in the direction `towards`.
 
-    No part of the body shades another part.
+    Its strength is given or that of a clear sky. No part of the body shades another part.
     """
 
     start: AwareDatetime | None = None
@@ -252,7 +254,7 @@ class Sun:
     towards: Direction | None = None
     """Direction from the mesh to the sun in the coordinates of the mesh, instead of date and place."""
     clear_sky: Literal["meinel"] | None = None
-    """meinel: direct and diffuse light under a clear sky at sea level by the height of the sun; goes with `start`."""
+    """meinel: direct and diffuse light under a clear sky at sea level, by the sun's elevation; goes with `start`."""
     direct_w_m2: AtLeastZero | None = None
     """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
     diffuse_w_m2: AtLeastZero = 0.0
@@ -275,7 +277,7 @@ class Sun:
             raise unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
 
     def irradiance(self, ground_reflectance: float = 0.0) -> Varying:
-        """Return the sunlight that falls on facets, [W / m2]; for `AbsorbedSolar.irradiance_w_m2`."""
+        """Return the sunlight on facets, [W / m2]; the ground reflects the share `ground_reflectance` of it."""
         resolution_s = math.inf if self.start is None else _SUN_RESOLUTION_S
         return Varying(partial(_sunlight, self, ground_reflectance), self.start is not None, resolution_s)
 
@@ -300,7 +302,7 @@ def _sunlight(sun: Sun, ground_reflectance: float, places: Places, time_s: float
 
 
 def check_one(**values: object) -> None:
-    """Raise `HeatError` unless exactly one of the fields is given."""
+    """Raise `HeatError` unless exactly one of the fields `values` is not None."""
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
         names = list(values)
@@ -310,7 +312,7 @@ def check_one(**values: object) -> None:
 
 
 def check_only_if(name: str, value: object, needed: bool, what: str) -> None:
-    """Raise `HeatError` unless the field `name` is given just where it is `needed`, beside `what`."""
+    """Raise `HeatError` if the field `name` is None although `what` needs it (`needed`), or given although not."""
     if needed and value is None:
         raise unclear(name, f"one, because {what} needs it", "none", f"Add {name}.")
     if not needed and value is not None:
@@ -318,5 +320,5 @@ def check_only_if(name: str, value: object, needed: bool, what: str) -> None:
 
 
 def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    """Return an error about entry `name` of a scene: what was `expected`, what was `got`, and what helps."""
+    """Return an error about the entry `name` of a scene."""
     return HeatError(name, expected=expected, got=got, remedy=remedy)

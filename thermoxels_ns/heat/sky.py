@@ -1,4 +1,4 @@
-"""Sky, ground and sun: long-wave exchange, the position of the sun, and the sunlight that reaches a facet."""
+"""Long-wave exchange with sky and ground, the position of the sun, and the sunlight that reaches a facet."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from thermoxels_ns.fem.selection import Places
 Vector = tuple[float, float, float]
 
 SOLAR_CONSTANT_W_M2 = 1353.0
-"""Sunlight above the atmosphere at the mean distance of the sun, [W / m2]: the value on which Meinel's fit is based.
-The modern value is 1361."""
+"""Sunlight above the atmosphere at the sun's mean distance, [W / m2], as in Meinel's fit; the modern value is 1361."""
 
-_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)  # Moment from which the sun's formulae count days
+_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)  # Day 0 of the formulae for the sun's position
 
 
 def swinbank_sky_c(air_c: float) -> float:
@@ -37,7 +36,7 @@ def swinbank_sky_c(air_c: float) -> float:
 
 
 def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Return the share of sky, (1 + cos tilt) / 2, in the view of surfaces with outward normals (k, 3), shape (k,).
+    """Return the view factor of the sky, (1 + cos tilt) / 2, shape (k,), for outward unit normals (k, 3).
 
     >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
     [1.0, 0.5, 0.0]
@@ -46,17 +45,18 @@ def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
 
 
 def ground_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Return the share of ground in the view of surfaces, (1 - cos tilt) / 2, shape (k,): 1 less `sky_view`."""
+    """Return the view factor of the ground, (1 - cos tilt) / 2, shape (k,), which is 1 - `sky_view`."""
     return 1.0 - sky_view(normals, up)
 
 
 def outdoor_radiation(
     emissivity: float, *, sky_c: Quantity | None = None, ground_c: float | None = None
 ) -> tuple[Quantity, Quantity]:
-    """Return the emissivity and `surroundings_c`, [degrees Celsius], of a `Radiation` to the sky, the ground or both.
+    """Return the arguments `emissivity` and `surroundings_c` of a `Radiation` to the sky, the ground or both.
 
-    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4, which makes one effect exactly the sum of two. With sky or
-    ground alone, the emissivity is multiplied by its view factor F; the rest of the view exchanges nothing.
+    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4 with the view factors F, so that one effect equals the sum of
+    two. With sky or ground alone, the emissivity is multiplied by its F; the rest of the view exchanges no heat. At
+    least one of `sky_c` and `ground_c`, [degrees Celsius], must be given.
     """
     if sky_c is not None and ground_c is not None:
         mean = partial(_surroundings_c, sky_c, ground_c)
@@ -85,8 +85,8 @@ class SunPosition:
 
     azimuth_deg: float  # Direction along the horizon, clockwise from north, [degrees], 0 to 360
     elevation_deg: float
-    """Height over the horizon, [degrees]. Refraction is left out: it would lift the sun by 0.5 degrees at the horizon
-    and by 0.1 degrees at a height of 10 degrees."""
+    """Elevation over the horizon, [degrees], without refraction, which lifts the sun by 0.5 degrees at the horizon and
+    by 0.1 degrees at an elevation of 10 degrees."""
     distance_au: float  # Distance, [astronomical units]
 
 
@@ -99,9 +99,10 @@ class Sunlight:
 
 
 def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
-    """Return the sun's position at a moment with a time zone, right to 0.02 degrees from 1800 to 2200.
+    """Return the sun's position at a moment, which must have a time zone, to 0.02 degrees from 1800 to 2200.
 
-    The formulae are the low-precision ones of the Astronomical Almanac (US Naval Observatory).
+    The source is the low-precision formulae of the Astronomical Almanac (US Naval Observatory). Latitude is positive
+    to the north, longitude to the east.
 
     >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
     >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
@@ -125,9 +126,9 @@ def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) ->
 
 
 def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
-    """Return the unit vector to the sun in the coordinates of `up` and `north`; only the level part of `north` counts.
+    """Return the unit vector to the sun in the coordinates of `up` and `north`.
 
-    Raises `HeatError` if `up` and `north` are parallel.
+    The part of `north` along `up` is removed first. Raises `HeatError` if `up` and `north` are parallel.
     """
     upward, northward = (np.array(one) / np.linalg.norm(one) for one in (up, north))
     level = northward - (northward @ upward) * upward
@@ -142,16 +143,16 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Return the path of light through the air over that from the zenith, for 0 to 90 degrees (Kasten, Young 1989)."""
+    """Return the relative optical air mass, which is 1 at the zenith, for 0 to 90 degrees (Kasten and Young 1989)."""
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
 def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
-    """Return the sunlight under a clear sky at sea level, right to about a tenth; 0 if the sun is below the horizon.
+    """Return the sunlight under a clear sky at sea level, to about 10 %; 0 if the sun is below the horizon.
 
     Direct light is E0 * 0.7^(AM^0.678) with the air mass AM (Meinel and Meinel 1976). Diffuse light is E0 sin(h)
-    (0.271 - 0.294 tau), h being the elevation and tau the transmitted share of direct light (Liu and Jordan 1960). E0
-    is `SOLAR_CONSTANT_W_M2` / `distance_au`^2.
+    (0.271 - 0.294 tau) with the elevation h and the transmitted share tau of direct light (Liu and Jordan 1960). E0 is
+    `SOLAR_CONSTANT_W_M2` / `distance_au`^2.
     """
     if elevation_deg <= 0.0:
         return Sunlight(0.0, 0.0)
@@ -164,12 +165,11 @@ def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight
 def facet_irradiance(
     normals: FloatArray, up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
 ) -> FloatArray:
-    """Return the sunlight that falls on facets, per area of the facet, shape (k,), [W / m2]; no facet shades another.
+    """Return the irradiance of facets by the sun, shape (k,), [W / m2] of the facet; no facet shades another.
 
-    Direct light counts by the cosine of its angle to the normal, diffuse light by (1 + cos tilt) / 2, and light that
-    the ground reflects by (1 - cos tilt) / 2 (Liu and Jordan 1963: sky and ground are evenly bright).
-    `normals` are outward unit vectors, shape (k, 3); `up` and `towards` (to the sun) are unit vectors. If the sun is
-    below the horizon, all values are 0.
+    Direct light is multiplied by the cosine between normal and sun, diffuse light by (1 + cos tilt) / 2, and light from
+    the ground by (1 - cos tilt) / 2 (Liu and Jordan 1963: sky and ground are evenly bright). All values are 0 if the
+    sun is below the horizon. Outward `normals` (k, 3), `up` and `towards` (the sun) must be unit vectors.
     """
     height = float(np.dot(up, towards))
     if height <= 0.0:

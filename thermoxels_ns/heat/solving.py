@@ -1,4 +1,4 @@
-"""Solving a heat problem without its negligible effects, either on its mesh with its steps or to a tolerance."""
+"""Solution of a heat problem without its negligible effects, either on the given mesh and steps or to a tolerance."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # Time steps in which a body is followed; None: its steady state
 
 MOST_ESTIMATED = 300_000
-"""Most tetrahedra for which the error of the mesh is estimated without being asked for. The estimate solves with
+"""Largest number of tetrahedra for which the mesh error is estimated without a request. The estimate solves with
 quadratic tetrahedra, which take 60 times as long as linear ones (131,712 tetrahedra: 5.4 s instead of 0.09 s)."""
 SAY_EVERY_S = 10.0  # Least time between two lines of progress, [s]
 
@@ -56,12 +56,13 @@ class SolvedProblem:
 
 
 def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
-    """Solve a problem without its negligible effects; `say` is called with lines of progress.
+    """Return the solution of a problem without its negligible effects; `say` is called with lines of progress.
 
-    Effects that bring little heat at any temperature of start and surroundings are left out at first. If at the
-    solution these bring more than `goals.left_out_share` of all heat, all are solved for again.
+    Effects that bring little heat at the extreme temperatures of start and surroundings are left out at first. The heat
+    that they would bring is then computed at the solution. If it exceeds `goals.left_out_share` of all heat, or if no
+    solution was found, the problem is solved again with all effects.
 
-    Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
+    Raises `HeatError` if more memory than allowed is needed, the solver fails, or the tolerance cannot be met.
     """
     if not goals.estimated:
         needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
@@ -101,8 +102,8 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
 def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     """Return the numbers of the weakest effects, which together have at most `share` of the power of the others.
 
-    An effect's power is its heat flow at the coldest and the warmest temperature of start and surroundings. Where any
-    effect changes with time, all are kept: what they bring between kept times is not known.
+    An effect's power is its largest heat flow if the whole body has the coldest, or the warmest, temperature of start
+    and surroundings. If any effect changes with time, the result is empty, because heat between kept times is unknown.
     """
     if time is not None and any(effect.changing for effect in problem.effects):
         return []
@@ -122,10 +123,10 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
 
 
 def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray) -> dict[int, float]:
-    """Return by number of each `chosen` effect the sum of the sizes of its heat flows in the worst state, [W].
+    """Return, by number of each `chosen` effect, the largest absolute heat flow in any state, summed over parts, [W].
 
-    `states_c`, (s, n), are temperatures, [degrees Celsius]. The sum is infinite for what fixes temperatures or changes
-    with time: these are never left out.
+    `states_c`, (s, n), are temperatures, [degrees Celsius]. The result is infinite for effects that fix temperatures or
+    change with time, because they are never left out.
     """
     reference_c, num_nodes = float(problem.start_c.mean()), len(problem.mesh.points_m)
     forms = effect_forms(problem, Space(problem.selection), reference_c)
@@ -154,7 +155,8 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
 
 
 def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
-    """Add an estimate of the mesh's error to a steady state if tetrahedra are few, fit in memory and can be solved."""
+    """Return `found` with an estimate of the mesh error, if it is a steady state without one. There is no estimate for
+    too many tetrahedra (`MOST_ESTIMATED`, memory), or if quadratic ones cannot be solved."""
     fits = len(found.problem.mesh.tets) <= MOST_ESTIMATED and peak_bytes(found.problem, order=2) <= goals.memory_bytes
     if isinstance(found.solution, SteadySolution) and found.accuracy is None and fits:
         with suppress(HeatError):
@@ -164,7 +166,7 @@ def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
 
 
 def _progress(say: Say) -> Progress:
-    """Return a function for `solve_heat` that says every `SAY_EVERY_S` how much of the time is done."""
+    """Return the argument `progress` of `solve_heat`, which reports through `say` at most every `SAY_EVERY_S`."""
     said_s = clock.perf_counter()
 
     def progress(share: float, steps: int) -> None:

@@ -1,4 +1,4 @@
-"""Weather files, for heat scenes, audits and heating seasons alike: csv tables of hours, and .epw files by pvlib."""
+"""Reader of weather files for heat scenes, audits and heating seasons: csv tables by hours, and .epw files by pvlib."""
 
 from __future__ import annotations
 
@@ -17,33 +17,34 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.yaml_records import wrong
 
 COLUMNS = ("outside_c", "inside_c", "wind_m_s", "cloud", "dew_point_c", "sun_w_m2")
-ALL_AROUND_DEG = (0.0, 90.0, 180.0, 270.0)  # North, east, south and west, for sunlight on walls of all sides
+ALL_AROUND_DEG = (0.0, 90.0, 180.0, 270.0)  # Azimuths of walls that face north, east, south and west
 _EPW = {
     "outside_c": ("temp_air", 1.0, 70.0),
     "dew_point_c": ("temp_dew", 1.0, 70.0),
     "wind_m_s": ("wind_speed", 1.0, 90.0),
     "cloud": ("total_sky_cover", 0.1, 10.0),
 }
-"""Columns that an .epw file has: name in pvlib, factor, and largest number that does not stand for a missing value."""
+"""Columns of an .epw file: name in pvlib, factor to our unit, and largest number that is not a missing value's mark."""
 _YEAR_H = 8760
-_LEAST_KNOWN, _MOST_SUN_W_M2 = 0.9, 2000.0  # Least share of known values of a column; larger sunlight is missing
+_LEAST_KNOWN, _MOST_SUN_W_M2 = 0.9, 2000.0  # Least share of known values in a column; largest sunlight that is known
 
 
 def read_weather(
     path: Path | str, start: datetime | None = None, *, facing_deg: Sequence[float] = (), any_year: bool = False
 ) -> dict[str, FloatArray]:
-    """Return `hours`, which grow, and each column of `COLUMNS` that a weather file has, shape (k,) each.
+    """Return the ascending `hours` and each column of `COLUMNS` that a weather file has, shape (k,) each.
 
     Args:
-        path: A csv file, whose first line names hours and columns and whose hours count from what the user calls 0; or
-            an .epw file (name ends so), whose values belong to the ends of its hours.
-        start: Hour 0 of an .epw file, in the standard time of its place if no time zone is stated; None: its beginning.
-        facing_deg: Directions that walls face, clockwise from north, [degrees]; sun_w_m2 of an .epw file is the mean of
-            the sunlight on them (ground of albedo 0.2); empty: no such column.
-        any_year: Take an .epw file for a typical year, which begins again at its end; else it has to hold `start`.
+        path: A csv file or, if the name ends in .epw, an .epw file. The first line of a csv file names hours and
+            columns; its user chooses hour 0. Values of an .epw file belong to the ends of its hours.
+        start: Time of hour 0 in an .epw file, in the standard time of its place if it has no time zone; None: the
+            beginning of the file.
+        facing_deg: Directions of walls, clockwise from north, [degrees]. The column sun_w_m2 of an .epw file is the
+            mean sunlight on these walls (ground of albedo 0.2); empty: no such column.
+        any_year: If True, an .epw file is a typical year that repeats; if False, it must cover `start`.
 
     Raises:
-        RecordError: The file cannot be read or is not in order, or pvlib is not installed.
+        RecordError: The file cannot be read, is not in order or does not cover `start`, or pvlib is not installed.
     """
     if Path(path).suffix.lower() == ".epw":
         return _read_epw(Path(path), start, facing_deg, any_year)

@@ -28,21 +28,21 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 BoundaryMode = Literal["conforming", "voxel"]
-"""How the boundary of a mesh runs: "conforming" along the level set of the density, "voxel" along voxel faces."""
+"""Course of a mesh's boundary: "conforming" follows the level set of the density, "voxel" follows voxel faces."""
 
 _NO_RULES = PatchRules()
 
 
 @dataclass(frozen=True)
 class BuiltMesh:
-    """A mesh, the solid voxels that it was made from, and what was left out of it."""
+    """A mesh, the solid voxels that it was made from, and the counts of parts that were left out."""
 
     mesh: TetMesh
     solid: SolidCells
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
     unobserved_voxels: int  # number of voxels of these parts; `solid.cells` does not hold them
     idle_rules: tuple[str, ...] = ()
-    """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
+    """The user's rules that no triangle or tetrahedron of the mesh follows, see `Applied.idle`."""
 
 
 def build_mesh(
@@ -69,10 +69,10 @@ def build_mesh(
         boundary: Whether the boundary follows the level set of the density, or voxel faces.
         up: Up direction in the coordinates of the mesh.
         rules: The user's rules for patches and regions.
-        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box is given.
+        metres_per_unit: Length, [m], of the unit of the input poses. The box of `selection` is in this unit.
 
     Raises:
-        MeshError: `select_solid` fails, or no node of the mesh was measured.
+        MeshError: `boundary` is another word, `select_solid` fails, or thermal rays measured no node of the mesh.
     """
     if boundary not in ("conforming", "voxel"):
         raise MeshError("boundary", expected="conforming or voxel", got=boundary, remedy="Pass one of them.")
@@ -139,7 +139,7 @@ def build_mesh(
 
 
 def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
-    """Return the solid voxels of all bodies of voxels, joined by faces, in which one of the points (n, 3) lies."""
+    """Return a mask of the solid voxels whose face-connected body holds one of the points (n, 3), [voxels]."""
     body = connected(cells, connectivity=1)
     chosen = np.zeros(int(body.max()) + 1, dtype=bool)
     chosen[body[tuple(np.floor(points).astype(np.int64).T)]] = True
@@ -148,7 +148,8 @@ def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
 
 
 def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:
-    """Return True for triangles in front of which the region ends, where the solid may go on, shape (f,)."""
+    """Return a mask (f,): True for triangles whose outer neighbour voxel lies outside the region of an export. `points`
+    (n, 3) are corner indices; `within` is True in voxels of the region. The solid may continue there."""
     # A smoothed surface lies at most half a voxel inside the voxel face that it stands for.
     beside = np.floor(points[facets].mean(axis=1) + 0.75 * facet_normals(points, facets)).astype(np.int64)
     inside = np.all((beside >= 0) & (beside < within.shape), axis=1)
@@ -160,10 +161,8 @@ def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> B
 def _seen_and_outside(
     mesh: TetMesh, points_index: FloatArray, solid: SolidCells, snapshot: GridSnapshot, rotation: FloatArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return which boundary triangles cameras see, all without cameras, and which count as exterior, shape (f,) each.
-
-    `points_index` are the nodes in corner indices, (n, 3); `rotation`, (3, 3), turns the trained scene to the mesh.
-    """
+    """Return two masks (f,): boundary triangles that cameras see (all if no cameras are known), and exterior triangles.
+    `points_index` (n, 3) are the nodes in corner indices. `rotation` (3, 3) turns the trained scene to the mesh."""
     normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:

@@ -15,8 +15,8 @@ from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, edge_stiffness
 
 MIN_OBSERVED_WEIGHT = 0.5
-"""Least weight of thermal rays at a measured node or corner, [fully absorbed rays]. Less weight is leakage through a
-surface or the tail of an interpolation."""
+"""Least weight of thermal rays at a node or corner that counts as measured, [fully absorbed rays]. Less weight comes
+from light that leaked through a surface, or from the tail of an interpolation."""
 _RELATIVE_RESIDUAL = 1e-9
 _MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
@@ -26,10 +26,10 @@ _LEAST_CONDUCTANCE = 1e-6
 def interpolate_corners(
     points_index: FloatArray, values: npt.NDArray, weights: npt.NDArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return corner values interpolated at points, with corners weighted by how well their values are known.
+    """Return corner values interpolated at points by normalised convolution (Knutsson and Westin, CVPR 1993).
 
     value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x, their
-    values v_c and `weights` w_c (normalised convolution; Knutsson and Westin, CVPR 1993).
+    values v_c and `weights` w_c.
 
     Args:
         points_index: Positions as fractional corner indices, shape (n, 3), within the lattice.
@@ -59,16 +59,16 @@ def extend_harmonically(
     observed: BoolArray,
     edge_weights: npt.NDArray,
 ) -> FloatArray:
-    """Return the temperatures of all nodes, shape (n,), [degrees Celsius], with unobserved nodes filled in.
+    """Return the temperatures of all nodes, shape (n,), [degrees Celsius], by harmonic extension to unobserved nodes.
 
-    Observed nodes keep their value. Every other node i meets sum_j w_ij (T_i - T_j) = 0 over its edges, as in steady
-    heat conduction in an insulated body, solved by conjugate gradients. No value leaves the observed range, because
-    weights below a very small positive weight are raised to it.
+    Observed nodes keep their value. Every other node i satisfies sum_j w_ij (T_i - T_j) = 0 over its edges, as in
+    steady heat conduction in an insulated body; conjugate gradients solve these equations. All values are within the
+    observed range, because weights below a very small positive number are raised to it.
 
     Args:
         edges: Node pairs, shape (e, 2); if a pair is listed several times, its weights add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
-        observed: True where a node's temperature is a measurement, shape (n,); one at least in each connected part.
+        observed: True for nodes with a measured temperature, shape (n,); at least one in each connected part.
         edge_weights: Conductance w of each edge, shape (e,), as from `tet_conductances`.
 
     Raises:
@@ -111,9 +111,9 @@ def extend_harmonically(
 
 
 def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the edges of tetrahedra, shape (6 t, 2), and conductances (6 t,): minus their linear stiffness entries.
+    """Return the edges of tetrahedra, (6 t, 2), and their conductances (6 t,): minus the entries of `edge_stiffness`.
 
     An edge is listed once for each tetrahedron around it. `extend_harmonically` is exact for temperatures linear in
-    space, except at edges whose entries sum to less than 0, which happens between obtuse angles.
+    space, except near edges with a negative sum of conductances, as between obtuse angles.
     """
     return tets[:, TET_EDGES].reshape(-1, 2), -edge_stiffness(points, tets).ravel()

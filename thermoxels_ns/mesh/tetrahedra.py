@@ -30,8 +30,8 @@ class Boundary:
     patch: IntArray  # patch of each triangle, an index into `patch_names`, shape (f,)
     patch_names: tuple[str, ...]  # names of the patches, all different; some may have no triangle
     photographs: IntArray | None = None
-    """Number of training photographs that see each triangle, and number of these that support it: texture and parallax,
-    or tracks, show that the surface lies there. Shape (f, 2); None if photographs were not compared."""
+    """Number of training photographs that see each triangle, and number of these that support it, shape (f, 2). A
+    photograph supports a triangle if texture and parallax, or tracks, show the surface there. None: not compared."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class TetMesh:
     tets: IntArray  # node indices, shape (t, 4), positively oriented: det(p1 - p0, p2 - p0, p3 - p0) > 0
     temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]; NaN everywhere if not known
     observed: BoolArray
-    """True where thermal rays measured the node's temperature; elsewhere it is a harmonic extension. Shape (n,)."""
+    """True for nodes whose temperature thermal rays measured, shape (n,); others have a harmonic extension."""
     facets: IntArray  # boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body
     facet_tags: IntArray  # `FACET_SURFACE` or `FACET_BOX` for each boundary triangle, shape (f,)
     region: IntArray  # region of each tetrahedron, an index into `region_names`, shape (t,)
     region_names: tuple[str, ...] = ("solid",)  # names of the regions, all different
     boundary: Boundary = None  # type: ignore[assignment]
-    """Tags of the boundary triangles. Left out: all are seen and belong to one patch, "boundary"."""
+    """Tags of the boundary triangles. By default all triangles are seen and belong to one patch, "boundary"."""
     colour: Float32Array | None = None
     """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if colours are not known."""
 
@@ -60,7 +60,7 @@ class TetMesh:
 
     @property
     def has_temperatures(self) -> bool:
-        """False for the mesh of a training on photographs alone, where no temperature is known."""
+        """False if no temperature is known, as after a training on photographs alone."""
         return not bool(np.isnan(self.temperature_c).all())
 
     def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
@@ -105,7 +105,7 @@ class TetMesh:
 
 
 def support_of_facets(mesh: TetMesh) -> IntArray | None:
-    """Return for each boundary triangle the index of its class in `SUPPORT`, -1 for `FACET_BOX` triangles, shape (f,).
+    """Return each boundary triangle's class, an index into `SUPPORT` or -1 for `FACET_BOX` triangles, shape (f,).
 
     The result is None if photographs were not compared.
     """
@@ -135,7 +135,7 @@ def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
 
 
 def nodes_and_triangles(facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the nodes that triangles (f, 3) use, ascending, shape (m,), and the triangles in numbers of these, (f, 3).
+    """Return the nodes that triangles (f, 3) use, (m,), ascending, and the triangles as indices into these, (f, 3).
 
     >>> nodes_and_triangles(np.array([[3, 0, 2]]))[1].tolist()
     [[2, 0, 1]]

@@ -13,21 +13,21 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 KUHN_PATTERN: IntArray = np.array(
     [[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]], dtype=np.int64
 )
-"""Voxel corners (`CORNER_OFFSETS`) of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
+"""Voxel corners (rows of `CORNER_OFFSETS`) of six tetrahedra around the main diagonal, (6, 4), positively oriented.
 
-Each permutation of the axes a, b, c gives a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
-Freudenthal 1942); if the sign of the permutation is negative, the two corners in the middle are exchanged."""
+Each permutation a, b, c of the axes gives a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
+Freudenthal 1942). If the sign of the permutation is negative, the two middle corners are exchanged."""
 
 
 def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return six tetrahedra for every solid voxel, which share the voxel's main diagonal.
+    """Return six tetrahedra per solid voxel, all at the voxel's main diagonal, and their nodes.
 
     The diagonal has the same direction in every voxel, so the mesh conforms. All dihedral angles are 45, 60 or 90
-    degrees, so solutions of the heat equation keep the maximum principle.
+    degrees, so solutions of the heat equation satisfy the maximum principle.
 
     Returns:
-        corner_indices: Lattice indices (i, j, k) of the corners of solid voxels, the nodes, in C order, shape (n, 3).
-        tets: Row numbers in `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
+        corner_indices: The nodes: lattice indices (i, j, k) of corners of solid voxels, in C order, shape (n, 3).
+        tets: Nodes of tetrahedra, rows of `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
 
     >>> corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
     >>> corners.shape, tets.shape
@@ -46,7 +46,8 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
-    """Return `FACET_BOX` for facets on a side of the lattice, else `FACET_SURFACE`, (f,); points are corner indices."""
+    """Return `FACET_BOX` for triangles on a side of the lattice, else `FACET_SURFACE`, (f,). `points_index` (n, 3) are
+    the nodes in corner indices; `lattice_shape` is the number of corners along each axis."""
     # A triangle lies on the sides of the lattice, of which there are six, that its three nodes have in common.
     sides = np.concatenate([points_index == 0, points_index == np.array(lattice_shape) - 1], axis=1)
     on_box = sides[facets].all(axis=1).any(axis=1)

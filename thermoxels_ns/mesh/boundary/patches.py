@@ -1,4 +1,4 @@
-"""Patches of boundary triangles and regions of tetrahedra: the default ones, and those of a user's rules.
+"""Patches of boundary triangles and regions of tetrahedra, by default and by a user's rules.
 
 ``configs/patches-example.yaml`` explains every key of a user's file.
 """
@@ -23,7 +23,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 
-FACINGS = ("up", "side", "down")  # The directions that `facing` tells apart
+FACINGS = ("up", "side", "down")  # Classes of the direction of a normal, see the function `facing`
 DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
 """Names of the patches that every mesh has, from exterior-up to cut; the index of a name is the patch's number."""
 DEFAULT_REGION = "solid"  # Name of region 0
@@ -33,7 +33,7 @@ _Byte = Annotated[int, Field(ge=0, le=255)]
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # solvers do not tell capitals from small letters
 _COS_45 = math.sqrt(0.5) + 1e-9
-"""A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees counts as a side despite rounding."""
+"""A little above the cosine of 45 degrees: a roof of exactly 45 degrees is then a "side" in spite of rounding."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """Condition of a rule: the element's centroid lies on a plane or on the side to which `normal` points."""
+    """Condition of a rule: the element's centroid lies on a plane, or on the side to which `normal` points."""
 
     point: Vector  # Any point of the plane, [m]
     normal: Vector  # Direction across the plane, of any length above 0
-    depth: Annotated[float, Field(gt=0)] = math.inf  # Largest distance from the plane, [m]
+    depth: Annotated[float, Field(gt=0)] = math.inf  # Largest distance of the centroid from the plane, [m]
 
     def __post_init__(self) -> None:
         if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
@@ -75,7 +75,7 @@ class Colour:
 class RegionRule:
     """A user's rule for a region: a tetrahedron meets the rule if it meets all conditions that are not None."""
 
-    name: str  # Name of the patch or region; several rules may have one name
+    name: str  # Name of the patch or region; several rules may share a name
     box: Box | None = None
     plane: Plane | None = None
     colour: Colour | None = None
@@ -93,9 +93,9 @@ class RegionRule:
 class PatchRule(RegionRule):
     """A user's rule for a patch of boundary triangles, with two more conditions than a rule for a region."""
 
-    only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary that the rule applies to
+    only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part that the rule applies to; None: all
     facing: Literal["up", "side", "down", "any"] | Vector | None = None
-    """Where the normal points, see `facing`, or a direction that it is at most 45 degrees from; None: any."""
+    """Class of the outward normal, see the function `facing`, or a vector less than 45 degrees from it; None: any."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -105,7 +105,7 @@ class PatchRule(RegionRule):
 
 @dataclass(frozen=True)
 class PatchRules:
-    """A user's rules for patches and regions, in the order of the file; the last that an element meets counts."""
+    """A user's rules for patches and regions, in the order of the file. An element follows the last rule it meets."""
 
     patches: tuple[PatchRule, ...] = ()  # Rules for boundary triangles
     regions: tuple[RegionRule, ...] = ()  # Rules for tetrahedra
@@ -136,14 +136,13 @@ class Applied(NamedTuple):
     number: IntArray  # Index in `names` of each element's patch or region, shape (n,)
     names: tuple[str, ...]  # Names of all patches or regions
     idle: tuple[str, ...]
-    """Rules that no element follows, such as "patch roof (entry 2)": no element meets the conditions, or all that do
-    follow later rules."""
+    """Rules such as "patch roof (entry 2)" that no element follows: none meets it, or these meet later rules too."""
 
 
 def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
-    """Return the direction in which unit normals (f, 3) point, as indices into `FACINGS`, shape (f,).
+    """Return the class of the direction of each unit normal (f, 3), as indices into `FACINGS`, shape (f,).
 
-    A normal less than 45 degrees from the direction `up` is "up", more than 135 degrees from it "down", else "side".
+    A normal at less than 45 degrees to `up` is "up", at more than 135 degrees "down", else "side".
 
     Raises:
         MeshError: `up` is not three finite numbers, or is zero.
@@ -166,18 +165,18 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Return each triangle's patch: by the last rule that it meets, else one of `DEFAULT_PATCHES`.
+    """Return the patch of each boundary triangle: that of the last rule it meets, or else one of `DEFAULT_PATCHES`.
 
-    The default patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is
-    False, followed by the direction of `facing`, as in "exterior-up".
+    The default patch of a triangle with `on_box` is "cut". The names of the others are "exterior" if `seen` is True, or
+    "interior" if it is False, and then the class of the normal by `facing`, as in "exterior-up".
 
     Args:
         rules: The user's rules.
         centroids_m: Centroid of each boundary triangle, shape (f, 3), [m].
         normals: Outward unit normals in the axes of the centroids, shape (f, 3).
         up: Up direction in the axes of the centroids.
-        seen: True where some camera sees the triangle, shape (f,).
-        on_box: True where the scene box or the region of an export cuts the solid, shape (f,).
+        seen: True for triangles that count as exterior, such as those that some camera sees, shape (f,).
+        on_box: True for triangles at which the scene box or the region of an export cuts the solid, shape (f,).
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
 
     Raises:
@@ -201,9 +200,9 @@ def apply_patches(
 def with_patches(
     mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike, outside: BoolArray | None = None
 ) -> tuple[TetMesh, tuple[str, ...]]:
-    """Return a mesh with patches by a user's rules in place of its own, and the idle rules.
+    """Return a copy of a mesh whose patches follow a user's rules, and the rules that no triangle follows.
 
-    `outside`, shape (f,), is True for triangles that count as exterior; None: those that cameras see.
+    `outside`, shape (f,), is True for triangles that count as exterior. If it is None, they are all that cameras see.
     """
     patch, names, idle = apply_patches(
         rules,
@@ -226,15 +225,14 @@ def write_patch_rules(path: Path, rules: PatchRules, heading: str) -> None:
 
 
 def _told(fields: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the fields of a rule without those that leave a condition open."""
+    """Return the fields of a rule as a dictionary without None and infinite values, which set no condition."""
     return {name: value for name, value in fields if value is not None and value != math.inf}
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
     """Return the regions of tetrahedra by a user's rules; tetrahedra that follow no rule are in region 0, "solid".
 
-    Centroids (t, 3) are in [m], colours (t, 3) are red, green, blue in [0, 1]. Raises `MeshError` if a rule has a
-    colour but `tet_colours` is None.
+    Centroids (t, 3) are in [m], colours (t, 3) in [0, 1]. Raises `MeshError` if colours are None but a rule has one.
     """
     count = len(tet_centroids)
     allowed = [np.ones(count, dtype=bool)] * len(rules.regions)
@@ -251,7 +249,8 @@ def _applied(
     centroids: FloatArray,
     colours: npt.NDArray | None,
 ) -> Applied:
-    """Return `start` overwritten where rules hold; `allowed` has one mask per rule for conditions not checked here."""
+    """Return `start`, the default numbers (n,), overwritten by rules; `names` are the names of the default numbers.
+    Box, plane and colour are checked here. Rule k applies to elements at which the mask `allowed[k]`, (n,), is True."""
     owner = np.full(len(start), -1, dtype=np.int64)
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()

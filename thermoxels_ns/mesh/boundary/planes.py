@@ -1,4 +1,4 @@
-"""The flat elements of a building: planes of a mesh's boundary, closed where planes meet, with windows and doors."""
+"""Flat elements of a building: planes through a mesh's boundary, trimmed where they meet, with windows and doors."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_area_vectors
 
 LEAST_PLANE_M2 = 2.0  # Smallest area of a plane that bounds the body
-_MOST_TRIED = 48  # Directions in which planes are looked for
-_CUBE_M = 0.25  # Edge of cubes over which normals are averaged: single triangles are up to 20 degrees off
-_WRINKLE_M = 0.15  # Distance from a plane within which triangles belong to it
-_COVER_M = 0.25  # Least thickness of what stands out from a wall and covers it
-_RECESS_M = 0.6  # Largest depth of a pane behind its wall; least width of a plane
+_MOST_TRIED = 48  # Largest number of directions in which planes are looked for
+_CUBE_M = 0.25  # Edge of cubes over which normals are averaged; normals of single triangles are up to 20 degrees off
+_WRINKLE_M = 0.15  # A triangle belongs to a plane if its centroid is nearer to the plane than this
+_COVER_M = 0.25  # Least thickness of a part that covers a wall, such as a balcony
+_RECESS_M = 0.6  # Largest depth of a pane behind its wall; also least width of a plane
 _FACES = 0.7  # Least cosine between the normals of a triangle and of its element
-_SAME_M = 1e-5  # Points nearer to each other are one
+_SAME_M = 1e-5  # Points nearer to each other than this are one point
 _COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
-_PIXEL_M = 0.025  # Of the pictures of walls in which windows are looked for
+_PIXEL_M = 0.025  # Size of a pixel in the pictures of walls in which windows are looked for
 _RECESSED_M, _OTHER_COLOUR, _OTHER_K = 0.12, 0.15, 1.0
-"""Least differences between an opening and its wall: depth; distance of colours in [0, 1], or three times the wall's
-own median; temperature, or three standard deviations of the wall's own."""
-_LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.75  # Of an opening: shortest side, and share of its rectangle that it fills
-_DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height of its foot above that of the wall
+"""Least differences between an opening and its wall in depth, colour in [0, 1] and temperature. The last two rise to
+three times the median colour distance, and three standard deviations of the temperature, within the wall."""
+_LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.75  # Least side of an opening, and least share of its rectangle that it fills
+_DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height of its foot above the wall's foot
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ class FlatElement:
     kind: str  # wall, roof, floor, window or door
     outline_m: FloatArray  # Corners, shape (k, 3), counter-clockwise as seen from outside
     normal: FloatArray  # Unit vector out of the building, shape (3,)
-    azimuth_deg: float  # Direction that it faces, clockwise from north
+    azimuth_deg: float  # Direction of the normal, clockwise from north; 0 within 10 degrees of up or down
     tilt_deg: float  # Angle between normal and up: 0 a flat roof, 90 a wall, 180 a floor
-    behind: str  # What touches it outside: air, ground, or cover, which is what stands out, such as an overhang
-    facets: IntArray  # Boundary triangles on the element, without those of its openings; none if air does not touch it
-    openings: tuple[FlatElement, ...] = ()  # Windows and doors, drawn in the plane of their wall
-    depth_m: float = 0.0  # How far the triangles of an opening lie behind its outline
+    behind: str  # What touches it outside: air, ground, or cover (a part that stands out, such as an overhang)
+    facets: IntArray  # Boundary triangles on the element outside its openings; none if no air touches the element
+    openings: tuple[FlatElement, ...] = ()  # Windows and doors, their outlines in the plane of the wall
+    depth_m: float = 0.0  # Distance by which the triangles of an opening lie behind its outline
 
     @property
     def net_area_m2(self) -> float:
@@ -60,7 +60,7 @@ class FlatElement:
         return self.flat().area - sum(one.net_area_m2 for one in self.openings)
 
     def flat(self) -> Polygon:
-        """Return the outline in the axes of `plane_axes`."""
+        """Return the outline in the element's plane, [m], in the two axes that `plane_axes` gives."""
         return Polygon(self.outline_m @ plane_axes(self.normal))
 
 
@@ -70,11 +70,11 @@ class Building:
 
     elements: tuple[FlatElement, ...]
     volume_m3: float
-    left_out: float  # Share of the mesh's volume above the ground that lies outside the body, such as a balcony
+    left_out: float  # Share of the mesh's volume above the ground that is not in the body, such as balconies
     ground_m: float | None  # Height of the ground; None: no ground was found
     axes: FloatArray  # East, north and up in the mesh's coordinates, unit vectors as columns, shape (3, 3)
     origin_m: FloatArray
-    """Origin of the elements' coordinates in those of the mesh, shape (3,): 0, unless those exceed 10 km."""
+    """Origin of the elements' coordinates in mesh coordinates, (3,), [m]; 0 along axes below 10 km in the mesh."""
 
     def every(self) -> list[FlatElement]:
         """Return all elements and their openings."""
@@ -103,19 +103,19 @@ class _Surface(NamedTuple):
 
 
 def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Building:
-    """Find the planes of a mesh's boundary and the closed body between them, the faces of which are the elements.
+    """Return the flat elements of a building: faces of the closed body between planes through a mesh's boundary.
 
-    The planes cut space into convex cells. A cell belongs to the body if the mesh fills more than half of it; elements
-    are where such a cell touches one that does not, so they close exactly where planes meet. What no plane bounds, and
-    what stands out from walls, such as a balcony, is left out.
+    The planes cut space into convex cells. The body is the largest connected group of cells of which the mesh fills
+    more than half. An element is a face between a cell of the body and another cell, so elements close exactly at the
+    lines where planes meet. Parts that stand out from walls, such as balconies, or that no plane bounds are left out.
 
     Args:
         mesh: Mesh in metres of a building seen from outside, with the ground around it or without.
         up: Direction that points up, shape (3,).
-        north: Direction that points north, shape (3,); its part along `up` does not count.
+        north: Direction that points north, shape (3,); its part along `up` is removed.
 
     Raises:
-        MeshError: A direction is none, or the planes do not enclose a body.
+        MeshError: A direction is zero or not finite, `north` is parallel to `up`, or the planes enclose no body.
     """
     upwards = _unit(check_direction("up", up, "Pass --up 0 0 1.", MeshError))
     east = np.cross(_unit(check_direction("north", north, "Pass --north 0 1 0.", MeshError)), upwards)
@@ -152,7 +152,8 @@ def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Bui
 
 
 def _planes(surface: _Surface) -> list[_Plane]:
-    """Find planes: in the direction that most area faces, then in the opposite one, then in what is left."""
+    """Return the planes of a surface, found one after the other in the triangles that are left. Each plane is looked
+    for in the direction that most area faces, or opposite to the plane that was found just before."""
     at, normal, area = surface[1:4]
     cells = np.floor((at - at.min(axis=0)) / _CUBE_M).astype(np.int64)
     cube = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)[1]
@@ -183,10 +184,10 @@ def _planes(surface: _Surface) -> list[_Plane]:
 def _fitted(
     surface: _Surface, left: IntArray, best: FloatArray, found: Sequence[_Plane]
 ) -> tuple[_Plane | None, IntArray]:
-    """Return the plane on which most area of the triangles `left` lies that face `best`, and the triangles on it.
+    """Return the plane that holds most area of those of the triangles `left` that face `best`, and its triangles.
 
-    There is no plane if it is too small, or if its direction is uncertain: narrow, or scattered and parallel to none of
-    those `found`, as two distant ledges are.
+    `best` is a unit vector, `left` holds indices. The plane is None if it is too small or its direction is uncertain:
+    it is narrow, or its triangles are scattered (as on two distant ledges) and no plane in `found` is parallel.
     """
     corners, at, normal, area = surface[:4]
     faces = left[normal[left] @ best > 0.87]
@@ -211,7 +212,7 @@ def _fitted(
 
 
 def _is_detail(one: _Plane, other: _Plane) -> bool:
-    """Return whether a plane is a recess or a ledge of a larger one, such as the panes of all windows of a wall."""
+    """Return whether `one` is a recess or ledge of the larger plane `other`, as window panes are of their wall."""
     alike = float(one.normal @ other.normal) > 0.95 and abs(float(other.above(one.middle_m))) < _RECESS_M
     return alike and one.area_m2 < other.area_m2
 
@@ -219,10 +220,8 @@ def _is_detail(one: _Plane, other: _Plane) -> bool:
 def _closed_body(
     planes: Sequence[_Plane], ground: _Plane | None, middle: FloatArray, volume: FloatArray
 ) -> tuple[list[FlatElement], float, float]:
-    """Return the faces of the body between planes, without names, its volume, and the mesh's volume in it, [m3].
-
-    `middle` (t, 3) and `volume` (t,) are those of the mesh's tetrahedra above the ground.
-    """
+    """Return the faces of the body between planes, without names, the body's volume, and the mesh's volume in it, [m3].
+    `middle` (t, 3) and `volume` (t,) are the centroids and volumes of the mesh's tetrahedra above the ground."""
     every = [*planes, *([] if ground is None else [ground])]
     normals, offsets = np.array([one.normal for one in every]), np.array([one.normal @ one.middle_m for one in every])
     side = sum((one.above(middle) > 0.0).astype(np.int64) << n for n, one in enumerate(every))
@@ -275,7 +274,7 @@ def _closed_body(
 
 
 def _named(surface: _Surface, faces: list[FlatElement]) -> tuple[FlatElement, ...]:
-    """Return faces with names, the largest first, with triangles and openings."""
+    """Return the faces, the largest first, with names, boundary triangles and openings filled in."""
     elements, taken = list[FlatElement](), defaultdict[str, int](int)
     for face in sorted(faces, key=lambda one: -one.net_area_m2):
         level = not 10.0 < face.tilt_deg < 170.0
@@ -293,8 +292,9 @@ def _named(surface: _Surface, faces: list[FlatElement]) -> tuple[FlatElement, ..
 
 
 def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
-    """Return a wall with windows and doors: rectangles that are warmer or colder than most of the wall, and lie deeper
-    or have another colour; in a mesh without colours the temperature differs at least half as much as anywhere."""
+    """Return a wall with its windows and doors: rectangles with another temperature than most of the wall, which also
+    lie deeper or have another colour. In a mesh without colours, a temperature difference of more than half of the
+    largest (the 99 % quantile) stands for another colour."""
     axes, flat, foot = plane_axes(wall.normal), wall.flat(), float(wall.outline_m[0] @ wall.normal)
     at, deep = surface.middle_m @ axes, foot - surface.middle_m @ wall.normal
     low, high = np.array(flat.bounds).reshape(2, 2)
@@ -345,7 +345,7 @@ def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
 
 
 def _ends(mask: BoolArray) -> FloatArray:
-    """Return the median over the columns of a mask of their first pixel and of the one after their last, shape (2,)."""
+    """Return the medians, over the columns of a mask, of the first True row and of the row behind the last, (2,)."""
     columns = mask[:, mask.any(axis=0)]
     return np.array([np.median(columns.argmax(axis=0)), len(mask) - np.median(columns[::-1].argmax(axis=0))])
 
@@ -355,14 +355,15 @@ def _unit(vector: FloatArray) -> FloatArray:
 
 
 def plane_axes(normal: FloatArray) -> FloatArray:
-    """Return two unit axes in the plane of a normal, shape (3, 2): level to the right as seen from outside, and up."""
+    """Return two unit axes across a unit normal, as columns (3, 2): level to the right as seen from outside, and up."""
     level = np.cross((0.0, 0.0, 1.0), normal)
     level = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal) if np.linalg.norm(level) < 1e-3 else level
     return np.stack([_unit(level), np.cross(normal, _unit(level))], axis=1)
 
 
 def proposed_rules(building: Building) -> PatchRules:
-    """Return rules that make a patch of each element that air touches, by its name, and of the ground."""
+    """Return rules for one patch per element or opening with triangles, by its name, and for a patch "ground" if any.
+    The rules are in the coordinates of the mesh, rounded to 1 mm."""
     rules, axes, origin = list[PatchRule](), building.axes, building.origin_m
     if building.ground_m is not None:
         foot = _vector(origin + (building.ground_m - 0.2) * axes[:, 2])

@@ -1,7 +1,7 @@
-"""The mesh file formats, by the ending of the file's name.
+"""Writers of mesh files, chosen by the ending of the file's name.
 
-.vtu is written in `vtu`; here are .xdmf (FEniCSx, ParaView), .msh (Gmsh), .inp (CalculiX, Abaqus), which runs as it is,
-and .glb, the surface for browsers and phones.
+They are .xdmf (FEniCSx, ParaView), .msh (Gmsh), .inp (CalculiX, Abaqus; ready to run) and .glb (the surface alone, for
+browsers and phones); the module `vtu` writes .vtu.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MESH_FORMATS = (".vtu", ".xdmf", ".msh", ".inp", ".glb")
 """Endings of all formats: four with body and boundary (ParaView, FEniCSx, Gmsh, CalculiX), .glb with the surface."""
 _COLOUR_MAP = "inferno"  # perceptually uniform, readable in grey
 _DARKEST = 0.1  # share of the colour map's dark end that is not used, because it looks like shading
-_FAR_SIZES = 16.0  # positions of a body farther from the origin than so many of its sizes count from its middle
+_FAR_SIZES = 16.0  # a body is far away if its distance from the origin exceeds its size by this factor
 _UNLIT = "KHR_materials_unlit"
 
 BODY_GRID, FACET_GRID = "mesh", "facets"
@@ -40,7 +40,7 @@ _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
 _TRIANGLE, _TETRAHEDRON = 2, 4
 _INT, _DOUBLE = np.dtype("<i4"), np.dtype("<f8")
 _FACE_OPPOSITE: IntArray = np.array([3, 4, 2, 1], dtype=np.int64)
-"""Number in .inp files of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
+"""Number in .inp files of the face opposite to each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
 _ROWS_AT_ONCE = 1 << 15
 _CONDUCTIVITY_W_MK, _DENSITY_KG_M3, _SPECIFIC_HEAT_J_KGK = 1.7, 2200.0, 880.0  # concrete, as in the Thermoxels paper
 _REAL = "%.12E"  # Abaqus reads fields of at most 20 characters
@@ -66,7 +66,8 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
         up: Up direction in mesh coordinates, used for .glb.
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite, `up` is no direction, or names are alike for .inp.
+        MeshError: An array does not fit the mesh or is not finite, `up` is zero or not finite (.glb), or the mesh has
+            no temperatures or two names become equal (.inp).
         OutputError: A file cannot be written.
     """
     path = Path(path)
@@ -82,13 +83,13 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
 
 
 def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
-    """Write the boundary as binary glTF 2.0, lengths in [m], with a colour per node that stands for its temperature, or
-    is that of the photographs if the mesh has no temperatures, or else grey.
+    """Write the boundary as binary glTF 2.0, in metres, with a colour per node.
 
-    Up is +y in glTF, so the file holds a matrix that turns `up` to +y. Colours are stored as light intensities and
-    shown without lamps (``KHR_materials_unlit``), so that shading does not change them. Positions have single
-    precision; far from the origin they count from the body's middle, and the matrix moves them back. The vertex
-    attribute ``_TEMPERATURE_C`` holds the temperatures, the mesh's ``extras`` hold the ends of the colour map.
+    Colours show temperatures. A mesh without temperatures gets the colours of the photographs, or else grey. Colours
+    are stored as linear light and shown without lamps (``KHR_materials_unlit``), so shading does not change them. Up is
+    +y in glTF, so the file holds a matrix that turns `up` to +y. Positions are of single precision. A body far from the
+    origin has positions relative to its middle, and the matrix also moves them back. The vertex attribute
+    ``_TEMPERATURE_C`` holds temperatures, the mesh's ``extras`` hold the temperatures at the ends of the colour map.
     """
     import matplotlib
     import trimesh
@@ -133,7 +134,7 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
 
 
 def _finish(tree: dict[str, Any]) -> None:
-    """Make `_COLOR_0` the 16-bit colours of a glTF tree, which trimesh cannot write, shown without lamps."""
+    """Turn `_COLOR_0` of a glTF tree in place into 16-bit colours, which trimesh cannot write, shown without lamps."""
     (primitive,) = tree["meshes"][0]["primitives"]
     primitive["attributes"]["COLOR_0"] = number = primitive["attributes"].pop("_COLOR_0")
     tree["accessors"][number]["normalized"] = True
@@ -158,7 +159,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             mesh.topology.create_connectivity(2, 3)
             patches = file.read_meshtags(mesh, name="facets")
 
-    The .h5 is written first; there is no .xdmf until it is complete.
+    The .h5 is written first. No .xdmf exists until the .h5 is complete.
     """
     import h5py
 
@@ -224,8 +225,8 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
 
     Regions become physical volumes and patches physical surfaces, numbered from 1; empty regions and patches are left
     out. Nodal temperatures become a view, `TEMPERATURE_VIEW`. Node k and tetrahedron k of the mesh get the number
-    k + 1, and the boundary triangles follow. Layout: "MSH file format version 2", Gmsh reference manual; other than
-    version 4 it sorts no nodes by surfaces and volumes. meshio cannot write a patch named like a region.
+    k + 1; boundary triangles get the numbers after the tetrahedra. Layout: "MSH file format version 2", Gmsh reference
+    manual; it does not group nodes as version 4 does. meshio cannot write a patch that has the name of a region.
     """
     path = Path(path)
     mesh.check()
@@ -250,14 +251,15 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
 
 
 def _numbered(first: int, field: tuple, values: npt.NDArray) -> bytes:
-    """Return the rows of `values`, each behind its number, as bytes; numbers rise from `first`."""
+    """Return a table as bytes: each row has a number, counted from `first`, and one of `values`, of type `field`."""
     table = np.empty(len(values), dtype=[("number", _INT), field])
     table["number"], table[field[0]] = np.arange(first, first + len(values)), values
     return table.tobytes()
 
 
 def _elements(kind: int, first: int, cells: IntArray, group: IntArray) -> bytes:
-    """Return elements of one kind as bytes; `group` is their physical group and their geometrical entity."""
+    """Return elements (n, k) of one kind as bytes, numbered from `first`. `group` (n,), from 0, becomes both the
+    physical group and the geometrical entity, from 1."""
     if not len(cells):
         return b""
     rows = np.column_stack([group, group, cells]) + 1
@@ -301,14 +303,14 @@ def write_inp(path: Path | str, mesh: TetMesh, *, steps: int = 10, step_seconds:
 
 
 def check_start(mesh: TetMesh) -> None:
-    """Raise `MeshError` if a mesh has no temperatures, with which a computation by an .inp file starts."""
+    """Raise `MeshError` if a mesh has no temperatures; an .inp file needs them as initial temperatures."""
     if not mesh.has_temperatures:
         remedy = "Leave inp out of --formats."
         raise MeshError("mesh for .inp", expected="temperatures at the start", got="none", remedy=remedy)
 
 
 def _set_names(name: str, names: Sequence[str]) -> list[str]:
-    """Return the names as .inp files can hold them; raise `MeshError` if two become equal."""
+    """Return the names in capitals, letters, digits and underscores only; raise `MeshError` if two become equal."""
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
     if len(set(written)) != len(written):
         expected = "names that differ in their letters and digits (capitals or not), as .inp files ask for"
@@ -317,7 +319,8 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
 
 
 def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
-    """Yield each used name and its members, rising; `index` has the number of each element's patch or region."""
+    """Yield each name that has elements, and these elements' numbers, ascending. `index` (n,) holds the patch or region
+    of each element, as an index into `names`."""
     for number, name in enumerate(names):
         members = np.flatnonzero(index == number)
         if len(members):
@@ -325,7 +328,7 @@ def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray
 
 
 def _rows(row: str, *columns: npt.NDArray) -> Iterator[str]:
-    """Yield the text of a table in chunks of many rows, which Python formats much faster than single rows."""
+    """Yield the text of a table in chunks of many rows, which is faster than row by row; `row` is a % format."""
     for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
         chunk = [column[start : start + _ROWS_AT_ONCE].tolist() for column in columns]
         yield row * len(chunk[0]) % tuple(chain.from_iterable(zip(*chunk)))

@@ -1,4 +1,4 @@
-"""Meshes as pyvista objects and as VTK files, made and read: the body (.vtu) and its tagged boundary (.vtp)."""
+"""Conversion of meshes to and from pyvista objects and VTK files: the body (.vtu) and its tagged boundary (.vtp)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 
 
 def write_vtk(path: Path, data: pv.PolyData | pv.UnstructuredGrid) -> None:
-    """Write polygons (.vtp) or a grid (.vtu) as ParaView and pyvista read it; raise `OutputError` on failure."""
+    """Write polygons (.vtp) or a grid (.vtu) for ParaView and pyvista; raise `OutputError` if writing fails."""
     from vtkmodules.vtkCommonDataModel import vtkFieldData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
@@ -72,7 +72,7 @@ def write_vtk(path: Path, data: pv.PolyData | pv.UnstructuredGrid) -> None:
 
 @contextmanager
 def silent_vtk() -> Iterator[Any]:
-    """Keep VTK from writing to the terminal; yield an object whose `events` are the errors that VTK reports."""
+    """Keep VTK from writing to the terminal; yield an object whose `events` list the errors that VTK reports."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -98,11 +98,11 @@ def boundary_path(path: Path | str) -> Path:
 def read_mesh(path: Path | str) -> TetMesh:
     """Return the mesh in ``NAME.vtu`` and the ``NAME-boundary.vtp`` beside it.
 
-    The mesh is equal, bit for bit, to the mesh that was written, except for colours, which files hold as bytes.
+    The mesh equals the written mesh bit for bit, except for colours, because files hold them as bytes.
 
     Raises:
-        MeshError: A file is missing, damaged or lacks an array, the cells are not sound tetrahedra, or the boundary
-            file is not that of the body.
+        MeshError: A file is missing, damaged or lacks an array, the cells are not tetrahedra that conform, or the
+            boundary file belongs to another body.
     """
     path = Path(path)
     if path.suffix != ".vtu":
@@ -112,7 +112,7 @@ def read_mesh(path: Path | str) -> TetMesh:
 
 
 def read_surface(path: Path) -> TetMesh:
-    """Return a file that has the arrays of `boundary_surface` as a mesh without tetrahedra; raises `MeshError`."""
+    """Return a boundary file as a mesh without tetrahedra; raise `MeshError` if it lacks an array."""
     data = _read(path)
     points = np.array(data.points, dtype=np.float64)
     data.point_data["node"] = np.arange(len(points))  # not those of the mesh, which is not there
@@ -130,15 +130,15 @@ def read_surface(path: Path) -> TetMesh:
 
 
 AnyMesh: TypeAlias = "pv.MultiBlock | pv.UnstructuredGrid | TetMesh | Path | str"
-"""What `any_mesh` takes."""
+"""A mesh in each of the forms that `any_mesh` takes."""
 
 
 def any_mesh(data: AnyMesh, up: Sequence[float] | None = None) -> tuple[TetMesh, dict[str, Any]]:
-    """Return a mesh and what is known about it: the content of its summary.json, or the user_dict of its blocks.
+    """Return a mesh and a dictionary about it: from its summary.json, from the user_dict of its blocks, or empty.
 
-    Blocks are those of `blocks_of`, a grid is what `mesh_of_grid` takes, a path that of the mesh.vtu of an export. If
-    given, `up` replaces the direction that is known. Raises `MeshError` for a mesh that is not sound, `HeatError` for
-    one that has no scale.
+    `data` is the path of an export's mesh.vtu, blocks as from `blocks_of`, a grid as for `mesh_of_grid`, or a mesh.
+    `up` replaces the entry "up" of the dictionary; None: the entry is kept. Raises `MeshError` if the mesh is damaged
+    or of another type, `HeatError` if its length unit is not metres.
     """
     import pyvista as pv
 
@@ -160,7 +160,8 @@ def any_mesh(data: AnyMesh, up: Sequence[float] | None = None) -> tuple[TetMesh,
 
 
 def read_export_summary(mesh: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Read the summary.json beside a mesh; empty if there is none. Raises `HeatError` if the mesh has no scale."""
+    """Return the content of the summary.json beside the mesh file `mesh`; if there is none, warn by `say` and return
+    {}. Raises `MeshError` if the file is damaged, `HeatError` if the mesh is not in metres."""
     path = mesh.with_name("summary.json")
     if not path.is_file():
         say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
@@ -207,10 +208,8 @@ def _read(path: Path) -> Any:
 
 
 def _sizes_fit(content: bytes) -> bool:
-    """Return whether the array sizes in a VTK file made by `write_vtk` are no larger than its bytes can hold.
-
-    VTK ends the process if a damaged size exceeds the memory. For files in another layout the result is True.
-    """
+    """Return False if a VTK file made by `write_vtk` states array sizes larger than its bytes can hold. VTK ends the
+    process if a damaged size exceeds the memory. Files in another layout are not checked: True."""
     header = re.search(rb'header_type="UInt(32|64)"[^>]*compressor="vtkZLibDataCompressor"', content)
     begin = re.search(rb'<AppendedData encoding="base64">\s*_', content)
     if header is None or begin is None:
@@ -229,7 +228,7 @@ def _sizes_fit(content: bytes) -> bool:
 
 
 def _numbers(letters: bytes, width: int, count: int) -> list[int]:
-    """Decode `count` little-endian numbers of `width` bytes from base64; bytes missing or not base64 become 255."""
+    """Decode `count` little-endian numbers of `width` bytes from base64; missing or undecodable bytes become 255."""
     try:
         found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
     except binascii.Error:
@@ -239,7 +238,7 @@ def _numbers(letters: bytes, width: int, count: int) -> list[int]:
 
 
 def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
-    """Return the blocks "body", see `body_grid`, and "boundary", see `boundary_surface`; `about` is their user_dict."""
+    """Return the blocks "body" (`body_grid`) and "boundary" (`boundary_surface`), with `about` as their user_dict."""
     import pyvista as pv
 
     blocks = pv.MultiBlock({BODY: body_grid(mesh), BOUNDARY: boundary_surface(mesh)})
@@ -248,7 +247,7 @@ def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
 
 
 def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
-    """Return arrays per node by name: `temperature_c`, `observed`, and `colour` in bytes, if known."""
+    """Return arrays per node by name: `temperature_c` and `observed` if known, and `colour` as bytes if known."""
     arrays: dict[str, npt.NDArray] = {}
     if mesh.has_temperatures:
         arrays["temperature_c"] = mesh.temperature_c
@@ -259,11 +258,11 @@ def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
 
 
 def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
-    """Return the tetrahedra, as .vtu files hold them; raises `MeshError` if an array does not fit or is not finite.
+    """Return the tetrahedra as the grid that .vtu files hold.
 
-    Point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0: extended)
-    where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
-    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
+    If temperatures are known, point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0:
+    extended); if colours are known, `colour` (red, green, blue as bytes). The cell array is `region`. A field array
+    `region:NAME` holds the number of each region, from 1. Raises `MeshError` if an array does not fit or is not finite.
     """
     import pyvista as pv
 
@@ -281,13 +280,12 @@ def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
 
 
 def boundary_surface(mesh: TetMesh) -> pv.PolyData:
-    """Return the boundary triangles with their tags, as .vtp files hold them; raises `MeshError` as `body_grid`.
+    """Return the boundary triangles with their tags as .vtp files hold them.
 
-    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch in
-    the field array `patch_names`, from 1 as in every format), `on_box` (1: the scene box or the region cuts the solid
-    there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
-    `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
-    mesh has colours, `colour` as bytes.
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch,
+    from 1, in the field array `patch_names`), `on_box` (1: the scene box or the region cuts the solid there) and, if
+    photographs were compared, `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point
+    arrays: `node` (number in the mesh, from 0) and those of `body_grid`. Raises `MeshError` as `body_grid` does.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -321,9 +319,10 @@ def boundary_surface(mesh: TetMesh) -> pv.PolyData:
 
 
 def mesh_of(body: Any, surface: Any, name: str = BODY, beside: str = BOUNDARY) -> TetMesh:
-    """Return the mesh that `body_grid` and `boundary_surface` made; `name` and `beside` name the two in messages.
+    """Return the mesh of a body made by `body_grid` and a surface made by `boundary_surface`.
 
-    The cell arrays `region` and `patch` may hold names in place of numbers. Raises `MeshError` as `vtu.read_mesh`.
+    The cell arrays `region` and `patch` may hold names in place of numbers. Messages call the body `name` and the
+    surface `beside`. Raises `MeshError` under the conditions of `read_mesh`.
     """
     _check_tetrahedra(body, name)
     points = np.array(body.points, dtype=np.float64)
@@ -351,10 +350,11 @@ def mesh_of(body: Any, surface: Any, name: str = BODY, beside: str = BOUNDARY) -
 
 
 def mesh_of_grid(grid: pv.UnstructuredGrid, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> TetMesh:
-    """Return a mesh of any grid of tetrahedra with a point array `temperature_c`, lengths in metres.
+    """Return the mesh of any grid of tetrahedra in metres with a point array `temperature_c`, [degrees Celsius].
 
-    The cell array `region`, if there is one, holds the region's name or number of each tetrahedron. The boundary gets
-    the patches exterior-up, -side and -down and, around closed cavities, interior-up, -side and -down; `up` decides.
+    The cell array `region`, if there is one, holds the name or number of the region of each tetrahedron. Boundary
+    triangles get the default patches by their direction relative to `up`: exterior-..., or interior-... around closed
+    cavities. Nodes without a point array `observed` count as measured.
 
     Raises:
         MeshError: The grid has other cells or none, no temperatures, or faces that three tetrahedra share.
@@ -416,10 +416,8 @@ def _checked(mesh: TetMesh, name: str, beside: str) -> TetMesh:
 
 
 def _numbered(values: npt.NDArray, names: tuple[str, ...]) -> tuple[IntArray, tuple[str, ...]]:
-    """Return numbers from 0 and their names, from `values` that are names, or numbers from 1 of `names`.
-
-    Without `names`, numbers become names.
-    """
+    """Return numbers from 0, shape (n,), and the names that they index. `values` (n,) are names, or numbers from 1 that
+    index `names`. If `names` is empty, the numbers become names."""
     values = np.asarray(values)
     if values.dtype.kind == "U" or not names:
         found, number = np.unique(values.astype(str), return_inverse=True)
@@ -441,7 +439,8 @@ def _names(body: Any, name: str) -> tuple[str, ...]:
 
 
 def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, IntArray, Boundary]:
-    """Return triangles (f, 3), their `FACET_BOX` or `FACET_SURFACE`, and their other tags."""
+    """Return boundary triangles (f, 3), their `FACET_BOX` or `FACET_SURFACE` (f,), and their other tags. `points` (n,
+    3) are the nodes of the body; messages begin with `name`. Raises `MeshError` if the two do not fit."""
 
     def array(of: str) -> npt.NDArray:
         return _array(surface.cell_data, of, name)

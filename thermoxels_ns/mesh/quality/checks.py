@@ -1,4 +1,4 @@
-"""Checks of a mesh: faces, edges and components, how many are missing, wrong or doubled, and figures of its shape."""
+"""Checks of a mesh: counts of missing, wrong or doubled faces and nodes, connected components, and figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoxels_ns.mesh.quality.tet_shapes import dihedral_cosines, signed_volum
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
-"""Node positions of a tetrahedron's faces; face f lies opposite node f, and its right-hand normal points outwards."""
+"""Nodes (0 to 3) of a tetrahedron's faces, (4, 3): row f is opposite node f; its right-hand normal points outwards."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Groups:
     """Rows of a table in groups of equal rows: group g has the row numbers `order[start[g]:start[g + 1]]`."""
 
     order: IntArray  # row numbers, group after group, shape (rows,)
-    start: IntArray  # where each group starts in `order`, (groups,); the last ends with `order`; sorted by content
+    start: IntArray  # index in `order` of the first row of each group, shape (groups,); groups are sorted by content
 
     @property
     def sizes(self) -> IntArray:
@@ -35,7 +35,7 @@ class Groups:
         return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
 
     def pairs(self) -> tuple[IntArray, IntArray]:
-        """Return all pairs of rows that follow each other in a group, as two arrays: first and second row of each."""
+        """Return all pairs of rows that follow each other in a group: the first rows (p,) and the second rows (p,)."""
         follows = np.ones(len(self.order), dtype=bool)
         follows[self.start] = False
         at = np.flatnonzero(follows)
@@ -43,7 +43,7 @@ class Groups:
 
 
 def group_pairs(first: IntArray, second: IntArray) -> Groups:
-    """Group row numbers: rows of a group have the same pair (first[row], second[row]), whole numbers of at least 0.
+    """Return groups of rows that have the same pair (first[row], second[row]) of whole numbers of at least 0.
 
     >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
     >>> groups.sizes, groups.first
@@ -55,13 +55,13 @@ def group_pairs(first: IntArray, second: IntArray) -> Groups:
 
 
 def group_faces(tets: IntArray) -> Groups:
-    """Group the faces of tetrahedra by their nodes; row 4 t + f is the face of tetrahedron t opposite its node f."""
+    """Return groups of faces with the same nodes; row 4 t + f is the face of tetrahedron t opposite its node f."""
     low, middle, high = np.sort(tets[:, OUTWARD_FACES], axis=2).reshape(-1, 3).T
     return group_pairs(low, middle * (int(high.max(initial=0)) + 1) + high)
 
 
 def group_sides(facets: IntArray) -> Groups:
-    """Group the sides of triangles by their ends; row 3 f + s is the side of triangle f from its node s to the next."""
+    """Return groups of triangle sides with the same ends; row 3 f + s is the side of triangle f from its node s on."""
     ends = np.roll(facets, -1, axis=1)
     return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
 
@@ -73,7 +73,7 @@ def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
 
 
 def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
-    """Return the faces that only one tetrahedron has, normals outwards, shape (f, 3), ordered by sorted node numbers.
+    """Return the faces of exactly one tetrahedron, (f, 3), normals outwards, in the order of their sorted nodes.
 
     `faces` is `group_faces(tets)`, computed if left out.
 
@@ -86,7 +86,7 @@ def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Return each boundary triangle's tetrahedron, and which of its nodes (0 to 3) is opposite the triangle; (f,) each.
+    """Return for each boundary triangle its tetrahedron (f,), and the node (0 to 3) opposite the triangle there (f,).
 
     Only faces whose nodes all lie on the boundary are sorted, so the time grows with the surface, not with the volume.
 
@@ -119,16 +119,16 @@ def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def count_twin_nodes(points: FloatArray) -> int:
-    """Return the number of nodes that are at exactly the same place as an earlier node."""
+    """Return the number of nodes at exactly the same place as another node that was counted before."""
     ordered = points[np.lexsort(points.T)]
     return int(np.count_nonzero(np.all(ordered[1:] == ordered[:-1], axis=1)))
 
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
-    """Return how many triangles are wrong in `mesh.facets` or missing there.
+    """Return the number of wrong triangles in `mesh.facets` plus the number of triangles that are missing there.
 
-    Right are all faces of exactly one tetrahedron, normals outwards. A triangle that is turned over counts twice, as
-    wrong and as missing. `faces` is `group_faces(mesh.tets)`.
+    `mesh.facets` must list every face of exactly one tetrahedron, with its normal outwards, and no other triangle. A
+    triangle that is turned over counts twice, as wrong and as missing. `faces` is `group_faces(mesh.tets)`.
     """
     wanted = boundary_facets(mesh.tets, faces)
     both = np.concatenate([wanted, mesh.facets]).astype(np.int64)
@@ -142,7 +142,7 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Return the number of pairs of triangles that share an edge and lie in one plane on the same side of the edge.
 
-    Such pairs show cracks, where faces of neighbours lie one upon the other. `sides` is `group_sides(facets)`.
+    These pairs show cracks: faces of neighbours lie upon each other, unconnected. `sides` is `group_sides(facets)`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
@@ -160,7 +160,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
 
 
 def count_tets_in_other_bodies(mesh: TetMesh) -> int:
-    """Return the number of tetrahedra whose centre lies inside another body; bodies are parts that share no node."""
+    """Return the number of tetrahedra whose centroid lies inside another body; bodies are parts that share no node."""
     import pyvista as pv
 
     points, tets = mesh.points_m, mesh.tets
@@ -185,24 +185,23 @@ def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float
 
 @dataclass(frozen=True)
 class MeshFigures:
-    """Figures of a sound mesh."""
+    """Figures of a mesh that passed `check_mesh`; lengths are in the unit of its nodes, here [m]."""
 
     volume_m3: float  # sum of the volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     dihedral_range_deg: tuple[float, float]
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]. The six tetrahedra of a voxel have
-    angles of 45, 60 and 90 degrees, conforming meshes 10.7 to 164.8."""
+    angles of 45, 60 and 90 degrees, conforming meshes 10.9 to 163.8."""
     num_non_manifold_edges: int
-    """Number of boundary edges with more than two boundary triangles: a boundary may touch itself, as bodies may."""
+    """Number of boundary edges with more than two boundary triangles; they are allowed where bodies touch."""
 
 
 def check_mesh(mesh: TetMesh) -> MeshFigures:
-    """Return figures of a mesh, lengths in the unit of its nodes; raise if no solver can use the mesh.
+    """Check that a solver can use a mesh, and return its figures.
 
     Raises:
         MeshError: A volume is not above 0, neighbours do not share whole faces, a node belongs to no tetrahedron, two
-            nodes are at one place, or the boundary is not closed; or the arrays do not fit each other or are not
-            finite, see `TetMesh.check`.
+            nodes are at one place, `facets` is not the boundary of the body, or `TetMesh.check` fails.
     """
     mesh.check()
     points, tets = mesh.points_m, mesh.tets

@@ -12,40 +12,41 @@ from thermoxels_ns.core.kernel_cache import kernel
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
 """Node positions of the two ends of a tetrahedron's six edges, shape (6, 2)."""
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
-"""For each edge of `TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
+"""The two faces that meet in each edge of `TET_EDGES`; face f is opposite node f."""
 _ANGLE_ROUND_OFF = 32.0 * float(np.finfo(np.float64).eps)
-"""Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
+"""Upper estimate of the round-off of a cosine if the tetrahedron's size equals its largest coordinate."""
 _LEAST = float(np.finfo(np.float64).tiny)
 
 
 def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Return volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative for tetrahedra turned over."""
+    """Return signed volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative for inverted tetrahedra."""
     volumes = np.empty(len(tets))
     _volumes(*_checked(points, tets), volumes)
     return volumes
 
 
 def flatness(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Return the least height of each tetrahedron over its longest side along an axis, (t,); below 0 if turned over."""
+    """Return each tetrahedron's least height divided by its size, shape (t,); below 0 if it is inverted. The size is
+    the largest x, y or z component of the sides at node 0."""
     flat = np.zeros(len(tets))
     _flatness(*_checked(points, tets), flat)
     return flat
 
 
 def dihedral_cosines(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Return the cosines of the dihedral angles at `TET_EDGES`, shape (t, 6); angles at a face without area are 0."""
+    """Return cosines of the dihedral angles at `TET_EDGES`, shape (t, 6); 1 at a face without area."""
     cosines = np.ones((len(tets), 6))
     _cosines(*_checked(points, tets), cosines)
     return cosines
 
 
 def edge_stiffness(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Return the stiffness entries of each tetrahedron's edges at conductivity 1, shape (t, 6), [m].
+    """Return the off-diagonal entries of each linear tetrahedron's stiffness matrix at conductivity 1, (t, 6), [m].
 
-    For linear shape functions f the entry of edge ij is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V), n being normals
-    of faces as long as twice their areas. This equals -l cot(a) / 6 with the length l of the opposite edge and the
-    dihedral angle a there: the entry is positive if a is obtuse, and 0 if a is right up to round-off of the
-    coordinates, or if V is 0.
+    The entry of edge ij in `TET_EDGES` is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V) with the volume V, the shape
+    functions f, and the normal n_i of the face opposite node i, of twice its area in length. This equals
+    -l cot(a) / 6 with the length l and the dihedral angle a of the opposite edge. The entry is positive if a is obtuse.
+    It is 0 if a differs from 90 degrees by round-off of the coordinates only, or if V is 0.
     """
     entries = np.zeros((len(tets), 6))
     _stiffness(*_checked(points, tets), _ANGLE_ROUND_OFF * float(np.abs(points).max(initial=0.0)), entries)
@@ -60,10 +61,10 @@ def _checked(points: FloatArray, tets: IntArray) -> tuple[FloatArray, IntArray]:
 
 @kernel
 def _shape(points: FloatArray, tet: IntArray, normals: FloatArray, squares: FloatArray):
-    """Return six times a tetrahedron's signed volume, and the longest extent of its sides along an axis.
+    """Return six times a tetrahedron's signed volume, and its size as `flatness` defines it.
 
-    Written are the inward normals of the faces opposite nodes 0 to 3, `normals` (4, 3), as long as twice the areas, and
-    the squares of their lengths (4,).
+    Row f of `normals` (4, 3) is overwritten with the inward normal of the face opposite node f, of twice the area in
+    length; entry f of `squares` (4,) with the square of this length.
     """
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = _sides(points, tet)
     normals[1, 0], normals[1, 1], normals[1, 2] = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx

@@ -1,4 +1,4 @@
-"""Lines of sight among solid voxels: where rays meet the first one or end, what cameras see of voxels and triangles."""
+"""Lines of sight among voxels: the first solid voxel on a ray, the ends of rays, what cameras see."""
 
 from __future__ import annotations
 
@@ -14,45 +14,46 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import RayEvidence, Views
 from thermoxels_ns.core.voxel_walk import cells_crossed
 
-MOST_CAMERAS = 128  # largest number of cameras that are counted; of more cameras, so many are chosen evenly
+MOST_CAMERAS = 128  # largest number of cameras that are counted; from more cameras, this number is chosen evenly
 SEEN_SHARE = 0.1
-"""A voxel is seen if at least this share of the cameras whose image holds the voxel, and at least one camera, has a
-free line to the voxel: a reconstruction has pinholes that single cameras look through."""
+"""Least share of the cameras whose image holds a voxel that must have a free line to it for the voxel to be seen; at
+least one camera must. The share ignores pinholes of the reconstruction, through which only single cameras look."""
 CLEAR_OF_CAMERA = 1.5  # solid voxels this close to a camera do not block it, [voxels]: floaters stick to cameras
 REACH = 1.5
-"""Distance from where a ray ends, [voxels], up to which it tells voxels how far away the surface is, and behind it
-within which it has to meet solid. 1 and 2.5 gave the same F-score within 0.0005 (wild-3, wild-12)."""
+"""Length of the part of a ray before and behind its end in which `distance_to_ends` uses the ray and `without_front`
+looks for solid, [voxels]. 1 and 2.5 gave the same F-score within 0.0005 (wild-3, wild-12)."""
 START_ABOVE_SURFACE = (1.0, 0.5)
-"""Distances along the normal from a triangle to the start of its line of sight, [voxels]. The first leads past the
-steps of voxel faces; the second is used if the first leads into a solid voxel, as in a gap of one voxel."""
-_STEP = 0.5  # Distance of the points along a ray whose voxels it tells, [voxels]
+"""Distances along the normal from a triangle to the start of its line of sight, [voxels]. The first clears the steps
+of voxel faces. The second replaces it if the first point is in a solid voxel, as in a gap one voxel wide."""
+_STEP = 0.5  # Distance between the points of a ray at which voxels are looked up, [voxels]
 
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """For each voxel, the number of cameras whose image holds it and how many of these have a free line to it."""
+    """Counts for each voxel of the cameras whose image holds the voxel, and of those with a free line to it."""
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""
-    free: npt.NDArray[np.uint8]  # number of these cameras with a free line to the voxel, which may be solid itself
+    free: npt.NDArray[np.uint8]  # number of these cameras with a free line to the voxel (free or solid itself)
 
     @property
     def seen(self) -> BoolArray:
-        """Return True for voxels that enough cameras see, by the rule of `SEEN_SHARE`."""
+        """True for voxels that enough cameras see, by the rule of `SEEN_SHARE`."""
         return (self.free > 0) & (self.free >= np.float32(SEEN_SHARE) * self.in_image)
 
     @property
     def hidden(self) -> BoolArray:
-        """Return True for voxels that lie in some camera's image but are not seen, as solid voxels block the view."""
+        """True for voxels that lie in some camera's image but are not seen, because solid voxels block the view."""
         return (self.in_image > 0) & ~self.seen
 
 
 def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
-    """Count for each voxel the cameras that see it, of at most `MOST_CAMERAS`; voxels True in `cells` block the view.
+    """Return for each voxel the counts of cameras that hold and see it, from at most `MOST_CAMERAS` cameras.
 
-    The space around each camera is six pyramids, one per side of the lattice. In each, rays that are one voxel apart at
-    the far end are followed from layer to layer. They meet a layer in a regular grid, so that the ray of a voxel takes
-    one look-up per axis. The cost is two or three passes over the lattice per camera.
+    Voxels that are True in `cells` block the view. The space around each camera is divided into six pyramids, one per
+    side of the lattice. In each pyramid, rays that are one voxel apart at the far end are followed from layer to layer.
+    The rays meet a layer in a regular grid, so one look-up per axis finds the ray of a voxel. The cost per camera is
+    two or three passes over the lattice.
     """
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:
@@ -79,10 +80,8 @@ def _count_along(
     order: tuple[int, int, int],
     sign: int,
 ) -> None:
-    """Add to `counts` what one camera has in its image and sees, in the pyramid around one half (`sign`) of an axis.
-
-    The axis is `order[0]`, that of the layers of `solid`; `counts` has both numbers of `CameraCounts`.
-    """
+    """Add one camera's view to `counts` (in place), in the pyramid around the half `sign` (1 or -1) of axis `order[0]`.
+    `solid`, `counts` (2, ...) and `eye` have their axes in `order`; `counts` holds the arrays of `CameraCounts`."""
     distance = sign * (np.arange(len(solid)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:
@@ -106,10 +105,11 @@ def _count_along(
 
 @kernel
 def _follow(solid, held, eye, u, v, low, step, owns, ahead, away, in_image, free):
-    """Follow rays of slopes `u` and `v`, from `low` in steps of `step`, through layers `ahead` at distances `away`.
+    """Follow rays through the layers `ahead` at the distances `away` (l,) from the camera, and count voxels in place.
 
-    Adds one to `in_image` for each voxel whose ray the image holds (`held`), and to `free` where nothing solid blocks
-    the ray. `owns` says for both axes whether rays of slope 1 or -1 belong to this pyramid.
+    One is added to `in_image` at each voxel whose ray is in the image, `held` (a, b), and to `free` if also no solid
+    voxel blocks the ray. Rays have the slopes `u` (a,) and `v` (b,); `low` and `step` (2,) are the lower ends and steps
+    of the slopes. `owns` (2,) says for both axes whether rays of slope exactly 1 or -1 belong to this pyramid.
     """
     clear, (_, num_u, num_v) = held.copy(), solid.shape
     ray_of_u, ray_of_v = np.empty(num_u, np.int64), np.empty(num_v, np.int64)
@@ -141,9 +141,10 @@ def _follow(solid, held, eye, u, v, low, step, owns, ahead, away, in_image, free
 def first_solid(
     cells: BoolArray, eye: FloatArray, directions: FloatArray, reach: FloatArray | float = np.inf
 ) -> FloatArray:
-    """Return the distances (n,), [voxels], from `eye` (corner indices) along unit vectors (n, 3) to solid voxels.
+    """Return the distance from `eye` (corner indices) along each unit vector (n, 3) to the first solid voxel, (n,).
 
-    A ray that meets none within `reach`, [voxels], gets infinity. Solid nearer than `CLEAR_OF_CAMERA` blocks no ray.
+    Distances and `reach` are in [voxels]. The distance is infinite if no solid voxel lies within `reach`. Solid voxels
+    within `CLEAR_OF_CAMERA` of the eye block no ray.
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
@@ -165,10 +166,10 @@ def _enter_solid(cells, shape, eye, directions, reach, clear, found):
 
 
 def distance_to_ends(evidence: RayEvidence, shape: tuple[int, ...]) -> Float32Array:
-    """Return how far in front of the surface each voxel's centre lies, shape `shape`, [voxels]; NaN where not known.
+    """Return each voxel centre's truncated signed distance in front of the surface, shape `shape`, [voxels].
 
-    The distance is that along a ray from the centre to the ray's end, negative behind it, as a mean over the rays that
-    cross the voxel within `REACH` of their ends (truncated signed distances, Curless and Levoy 1996).
+    The value is the mean, over rays that cross the voxel within `REACH` of their ends, of the distance along the ray
+    from the centre to the end; it is negative behind the end (Curless and Levoy 1996). Voxels without rays are NaN.
     """
     size = math.prod(shape)
     total, count = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.int32)
@@ -184,12 +185,11 @@ def distance_to_ends(evidence: RayEvidence, shape: tuple[int, ...]) -> Float32Ar
 
 
 def without_front(cells: BoolArray, evidence: RayEvidence, distance: Float32Array) -> BoolArray:
-    """Return the solid voxels without those whose centres lie in front of the surface where rays end.
+    """Return the solid voxels `cells` except those whose centre lies in front of the surface at which rays end.
 
-    Rays end in each voxel that holds a piece of the surface; with all of these, a body would be too large by half a
-    voxel. A voxel in front stays if a ray that ends in it would otherwise meet no solid within `REACH` behind its end,
-    as at a sheet thinner than a voxel. All stay if none would. `cells`, shape (nx-1, ny-1, nz-1), are the solid voxels;
-    `distance` is the result of `distance_to_ends`.
+    Every voxel that holds a piece of the surface stops rays, so a body of all these voxels is too large by half a
+    voxel. A voxel in front is kept if a ray that ends in it would otherwise meet no solid within `REACH` behind its
+    end, as at a sheet thinner than a voxel. If no voxel would be kept, all are. `distance` is `distance_to_ends`.
     """
     with np.errstate(invalid="ignore"):
         kept = cells & ~(distance > 0.0)
@@ -208,14 +208,14 @@ def ends_in_voxels(evidence: RayEvidence, shape: tuple[int, ...]) -> IntArray:
 
 
 def solid_at(cells: BoolArray, points: FloatArray | Float32Array) -> BoolArray:
-    """Return which points (n, 3), in corner indices, are in solid voxels, shape (n,); False outside the lattice."""
+    """Return True for points (n, 3), in corner indices, in solid voxels, shape (n,); False outside the lattice."""
     voxel, inside = _voxels_at(points, cells.shape)
     inside[inside] = cells[tuple(voxel.T)]
     return inside
 
 
 def _voxels_at(points: FloatArray | Float32Array, shape: tuple[int, ...]) -> tuple[IntArray, BoolArray]:
-    """Return the voxels (m, 3) of those points (n, 3) that lie in the lattice, and which points do, (n,)."""
+    """Return the voxels (m, 3) of the points in the lattice, and a mask (n,) of these points among all (n, 3)."""
     voxel = np.floor(points).astype(np.int64)
     inside = ((voxel >= 0) & (voxel < shape)).all(axis=1)
     return voxel[inside], inside
@@ -223,9 +223,9 @@ def _voxels_at(points: FloatArray | Float32Array, shape: tuple[int, ...]) -> tup
 
 @dataclass(frozen=True)
 class FacetViews:
-    """Which cameras see which boundary triangles; triangles are in groups, and one answer holds for a whole group."""
+    """The cameras that see each group of boundary triangles; all triangles of a group share one answer."""
 
-    group: IntArray  # Index in the arrays below of each triangle's group, shape (f,)
+    group: IntArray  # Group of each triangle, an index into the arrays below, shape (f,)
     middle: FloatArray  # Mean centroid of each group, shape (g, 3), [world units]
     normal: FloatArray  # Unit mean normal of each group, shape (g, 3)
     seen: BoolArray  # True where a camera sees a group, shape (g, cameras)
@@ -281,7 +281,7 @@ def facet_views(
 def seen_facets(
     cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
 ) -> BoolArray:
-    """Return True for boundary triangles that a camera of `views` sees, (f,); other arguments as in `facet_views`."""
+    """Return True for boundary triangles that some camera of `views` sees, (f,); arguments as in `facet_views`."""
     cameras = views.matrices(), views.camera_to_world[:, :, 3], views.size
     found = facet_views(cells, lattice, *cameras, centroids_world, normals_world)
     return found.seen.any(axis=1)[found.group]

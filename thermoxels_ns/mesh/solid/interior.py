@@ -1,4 +1,4 @@
-"""The inside of bodies of which only the shell was reconstructed: cavities, hidden space, walls of given thickness."""
+"""Voxels to fill in bodies of which only the shell was reconstructed: cavities, hidden space, walls."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hu
 
 LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
-"""Least winding number, in the seen surfaces, of inside space that the shell hides from cameras. The number is up to
+"""Least winding number of the seen surfaces at which voxels hidden by the shell count as inside. The number is up to
 one half behind a surface seen from one side only, and at most 0 in the shadow before a wall."""
-CREVICE_SURROUNDED = 0.3  # least winding number of inside space that only the filled inside hides
-STRAY_SHARE = 0.005
-"""Share of a body's voxels that may be strays: the outermost layers on each side, up to this share."""
+CREVICE_SURROUNDED = 0.3  # least winding number at which voxels hidden by the filled inside count as inside
+STRAY_SHARE = 0.005  # share of a body's voxels on each side, in the outermost layers, that may be strays
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
 MARGIN = 0.25  # the winding number is set to 0 at this share of the lattice's size outside the lattice, on each side
 THINNEST_GROWN = 1.5
@@ -31,14 +30,15 @@ THINNEST_GROWN = 1.5
 def interior(
     cells: BoolArray, lattice: Lattice, views: Views | None, seal: int, within: BoolArray | None = None
 ) -> BoolArray:
-    """Return the empty voxels inside bodies of which only a shell was reconstructed; `cells` are the shell's voxels.
+    """Return a mask of the empty voxels inside bodies of which only the shell `cells` was reconstructed.
 
-    Only voxels `within` a region are returned; solid outside the region still blocks the view. Voxels are one body if
-    they touch after openings of up to twice `seal` voxels are closed. Inside are the cavities of this sealed shell that
-    have no way out through voxel faces and no camera in them and, if the cameras are known, voxels in the body's convex
-    hull that lie in a camera's image, are hidden by the shell (`count_cameras`) and surrounded by the backs of seen
-    surfaces (`winding_number`). A second pass takes the voxels found as solid and adds crevices that these hide, where
-    surfaces surround them well (`CREVICE_SURROUNDED`).
+    First, openings of the shell up to twice `seal` voxels wide are closed; voxels that then touch are one body. A voxel
+    is inside if it is in a cavity: empty space without a camera and without a way out through voxel faces. If cameras
+    are known (`views`), a voxel of a body's convex hull is also inside if it lies in a camera's image, the shell hides
+    it from cameras (`count_cameras`), and the backs of seen surfaces surround it (`winding_number`). A second pass
+    treats the voxels found as solid, and adds crevices that they hide and surfaces surround (`CREVICE_SURROUNDED`).
+
+    The result is restricted to the region `within` (None: everywhere); solid outside it still blocks the view.
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     inside, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -52,7 +52,7 @@ def interior(
 def _enclosed(
     cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Return two masks, cavities without and with a camera, both of the shell and of the sealed shell."""
+    """Return two masks, cavities without and with a camera, of the shell `cells` and of the `sealed` shell together."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
     cameras = camera_voxels(cells, lattice, views)
     # Sealing closes alcoves and corridors of a cavity, where cameras may stand: cameras are grown by the same width.
@@ -80,9 +80,9 @@ def camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> Bo
 
 
 def cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return two masks, cavities without and with a camera (a voxel True in `cameras`).
+    """Return two masks: voxels of cavities without a camera, and of cavities with one (a voxel True in `cameras`).
 
-    A cavity is empty voxels without a way out of the lattice through voxel faces.
+    A cavity is a connected set of empty voxels without a way out of the lattice through voxel faces.
     """
     labels = connected(np.pad(~shell, 1, constant_values=True), connectivity=1)
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
@@ -95,7 +95,7 @@ def cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray
 
 
 def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
-    """Return the voxels within a body's convex hull that no camera sees and that seen surfaces surround."""
+    """Return a mask of voxels in a body's convex hull that no camera sees and that seen surfaces surround."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
@@ -113,7 +113,7 @@ def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views
 
 
 def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
-    """Return the voxels that are hidden from cameras and have a winding number of at least `surrounded`."""
+    """Return a mask of voxels that are hidden from cameras and have a winding number of at least `surrounded`."""
     counts = count_cameras(cells, lattice, views)
     return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
 
@@ -121,7 +121,7 @@ def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float)
 def _hidden_in_blocks(
     sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int, block: int
 ) -> BoolArray:
-    """Return the result of `_hidden`, with one answer for a block of `block`^3 voxels."""
+    """Return the result of `_hidden` at lower resolution, with one answer for each block of `block`^3 voxels."""
     shape = sealed.shape
     padded = np.pad((sealed, within), [(0, 0), *((0, -n % block) for n in shape)])
     cx, cy, cz = (n // block for n in padded.shape[1:])
@@ -140,7 +140,7 @@ def _hidden_in_blocks(
 
 
 def _without_strays(body: BoolArray) -> BoolArray:
-    """Return a body without its strays: the outermost layers on each side with at most `STRAY_SHARE` of its voxels."""
+    """Return a body without strays: the outermost layers on each side that hold at most `STRAY_SHARE` of its voxels."""
     most, kept = STRAY_SHARE * np.count_nonzero(body), body
     for axis in range(3):
         layers = np.count_nonzero(body, axis=tuple(other for other in range(3) if other != axis))
@@ -150,13 +150,12 @@ def _without_strays(body: BoolArray) -> BoolArray:
 
 
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
-    """Return for each voxel the winding number of the surface made of all voxel faces between `solid` and `air`.
+    """Return the generalised winding number at each voxel of the surface of all faces between `solid` and `air` voxels.
 
-    The number is 1 inside a closed surface and 0 outside; through a hole in the surface it changes gradually. Faces
-    between two solid voxels, or next to a voxel that is neither solid nor air, are no surface. For triangles see
-    Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers,
-    equation 5. The number w jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps J.
-    This equation is solved by sine transforms.
+    The number is 1 inside a closed surface and 0 outside; it changes gradually through a hole in the surface. Faces of
+    a voxel that is neither solid nor air do not belong to the surface. For triangles see Jacobson, Kavan and
+    Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers, equation 5. The number w
+    jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps J (by sine transforms).
     """
     # The lattice is padded to lengths for which the transforms are fast, and lies about in the middle.
     lengths = [_fast_length(int(np.ceil((1.0 + 2.0 * MARGIN) * n)) + 3) - 1 for n in solid.shape]
@@ -176,11 +175,11 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
 
 
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
-    """Return the empty voxels to add behind seen surfaces so that these become walls of a `thickness`, [voxels].
+    """Return a mask of empty voxels that, added behind seen surfaces, make these walls of a `thickness`, [voxels].
 
-    An empty voxel is added if its middle is within the thickness of the outer face of the nearest solid voxel that
-    enough cameras see, and if the straight line between the two voxels leads through voxels that are solid or not seen.
-    The thickness includes the seen voxel. A plate that is seen from both sides does not grow.
+    An empty voxel is added if its middle lies within the thickness behind the outer face of the nearest solid voxel
+    that enough cameras see, and every voxel on the straight line between the two is solid or not seen. The thickness
+    includes the seen voxel. A plate that is seen from both sides does not grow.
     """
     added = np.zeros_like(cells)
     # The middle of a surface voxel lies half a voxel below its face, so this is how far from it other middles may be.

@@ -1,4 +1,4 @@
-"""The level on voxel centres whose zero is the surface, made so that thin and small bodies keep their volume."""
+"""The level function at voxel centres, whose zero is the surface; thin and small bodies keep their volume."""
 
 from __future__ import annotations
 
@@ -11,22 +11,20 @@ from scipy import ndimage
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 
-DEEP_QUANTILE = 0.95  # quantile of the density of the dense voxels at which the level is 1 before smoothing
-DEEP_RATIOS = (2.0, 100.0)  # lowest and highest ratio of that density to the threshold
+DEEP_QUANTILE = 0.95  # quantile of the dense voxels' density at which the level is 1 before smoothing
+DEEP_RATIOS = (2.0, 100.0)  # lowest and highest ratio of this density to the threshold
 LEAST_LEVEL = 0.02
 """Least distance of levels from 0 before smoothing, so that the surface never passes through a voxel's centre."""
-LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, and its sign
-LEAST_SHARE_THIN = 0.5  # the same for walls and gaps one voxel thick, which then keep their thickness
+LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, and keeps its sign
+LEAST_SHARE_THIN = 0.5  # the same share in walls and gaps one voxel thick, so that they keep their thickness
 MARGIN = 4  # voxels farther than this outside the bounding box of the solid have level -1, whatever their density
 UNNOTICED = 0.12
-"""Share of the solid (for gaps: of the empty space) around a voxel that smoothing may remove, as at edges of large
-bodies and single bumps of noise; only what is missing beyond it is made up."""
+"""Share of the solid (for gaps: of the empty space) around a voxel that smoothing may remove without correction, as it
+does at edges of large bodies and single bumps of noise."""
 
-_ROUNDS = 5  # number of rounds in which missing volume is found and made up
-_RATE = 1.5  # share of the missing volume that a round makes up where all of the surface moves alike
-_LEAST_SLOPE = 0.6
-"""Least change of the level per voxel of shift, [1 / voxel]; with less, a speck that smoothing nearly removed would
-never grow back."""
+_ROUNDS = 5  # number of rounds in which missing volume is found and restored
+_RATE = 1.5  # share of the missing volume that one round restores if all of the surface moves alike
+_LEAST_SLOPE = 0.6  # least change of the level per voxel of shift, [1 / voxel]; less would not restore small specks
 _CHUNK = 1 << 14  # number of voxels worked on at a time, so that their data stay in the processor's cache
 _AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
 _WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1)
@@ -39,13 +37,13 @@ def level_of(
     cells: BoolArray,
     distance: Float32Array | None = None,
 ) -> Float32Array:
-    """Return a level in [-1, 1] for every voxel: above 0 in solid voxels, below 0 in empty voxels, 0 on the surface.
+    """Return the level of every voxel, in [-1, 1]: above 0 in solid voxels, below 0 in empty voxels, 0 on the surface.
 
-    Let s = log(density / threshold) / log(deep / threshold), where deep is the density of the densest part of the body.
-    The level is s, at most 1, where s is above 0, and exp(s) - 1 below: 0 at the threshold and -1 without density.
-    Trained density jumps by orders of magnitude between neighbours; the logarithm keeps what it says about the place of
-    the surface. The levels are then smoothed with weights 1 2 1 along each axis against noise, and shifted where thin
-    or small bodies would lose volume by the smoothing.
+    Let s = log(density / threshold) / log(deep / threshold). Here, deep is the density at `DEEP_QUANTILE` of the dense
+    voxels, kept within `DEEP_RATIOS`. The level is min(s, 1) for s above 0, else exp(s) - 1: it is 0 at the threshold
+    and -1 without density. The logarithm suits trained density, which jumps by orders of magnitude between neighbours.
+    The levels are then smoothed with weights 1 2 1 along each axis against noise. Where smoothing takes volume from
+    thin or small bodies, the levels are shifted to restore it. All arrays have one shape (nx-1, ny-1, nz-1).
 
     Args:
         density: Density at voxel centres, at least 0, [1 / world unit].
@@ -53,8 +51,7 @@ def level_of(
         dense: True for voxels that the threshold chose.
         cells: True for solid voxels. Solid voxels that are not dense were added by a later step and get level 1 before
             smoothing; dense voxels that are not solid were removed by a later step and get level -1.
-        distance: Distance of voxel centres in front of where rays end, [voxels]; where it is known, not NaN, its
-            negative is the level before smoothing. None: nowhere known.
+        distance: Result of `distance_to_ends`; if not NaN, its negative is the level before smoothing. None: all NaN.
     """
     result = np.full(cells.shape, -1.0, dtype=np.float32)
     near, threshold = bounding_box(cells, MARGIN), max(threshold, float(np.finfo(np.float64).tiny))
@@ -91,7 +88,8 @@ def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolAr
 
 
 def _thin(cells: BoolArray) -> BoolArray:
-    """Return voxels of walls one voxel thick: single along an axis, with at least two such voxels beside them."""
+    """Return a mask of voxels of walls one voxel thick. Such a voxel has no solid neighbour along one axis; at least
+    two of its other neighbours are such voxels as well."""
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & (_beside(cells, axis) == 0)
@@ -101,18 +99,19 @@ def _thin(cells: BoolArray) -> BoolArray:
 
 
 def _beside(cells: BoolArray, axis: int) -> npt.NDArray[np.uint8]:
-    """Return the number of each voxel's two neighbours along an axis that are solid; outside it counts itself."""
+    """Return the number (0 to 2) of each voxel's solid neighbours along an axis; border voxels repeat outwards."""
     return np.asarray(ndimage.convolve1d(cells.view(np.uint8), [1, 0, 1], axis=axis, mode="nearest"), dtype=np.uint8)
 
 
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
-    """Return a smoothed level, shifted so that the solid volume around every voxel is about that of the `sharp` level.
+    """Return the smoothed `level`, shifted so that the solid volume around each voxel is about that of `sharp`.
 
-    Smoothing alone would leave a third of a bar one voxel thick. For each voxel near the surface, the solid share is
-    taken from the trilinear level, and the wanted share from where the sharp level changes its sign along the axes.
-    Their difference, averaged with weights 1 4 6 4 1 along each axis and divided by the area of the surface around, is
-    the distance by which the surface should move. Averages below `UNNOTICED` times the volume around are left alone, so
-    that faces and long edges of large bodies stay. Signs stay, and no level comes nearer to 0 than `least`.
+    Smoothing alone leaves a third of a bar one voxel thick. For each voxel near the surface, the solid share is found
+    from the trilinear level, and the wanted share from the sign changes of the sharp level along the axes. The
+    difference of the shares is averaged with weights 1 4 6 4 1 along each axis. This average divided by the area of the
+    surface around the voxel is the distance by which the surface should move. Averages below `UNNOTICED` times the
+    volume around are ignored, which keeps faces and long edges of large bodies in place. Levels keep their sign, and
+    their distance from 0 is at least `least`. All arrays have the same shape; `cells` is True for solid voxels.
     """
     some, every = (look(cells, 3, mode="nearest") for look in (ndimage.maximum_filter, ndimage.minimum_filter))
     near = np.pad(np.not_equal(some, every), 1)
@@ -151,7 +150,8 @@ def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, 
 
 
 def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Return the wanted solid share of the voxels `index`, and the number of their neighbours across the surface."""
+    """Return the wanted solid share of the voxels `index`, and the number (0 to 6) of neighbours across the surface.
+    `sharp` is a flat array of levels, `index` (n,) holds positions in it, `strides` (3,) the steps along the axes."""
     # Along each axis, a voxel reaches from its centre to the surface on each side, but at most half a voxel.
     own = sharp[index]
     share, sides = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=np.float32)
@@ -168,7 +168,7 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
 
 
 def _octant_weights() -> tuple[Float32Array, Float32Array]:
-    """Return weights of the 27 levels around a voxel in the value (8, 27) and gradient (3, 8, 27) at octant centres."""
+    """Return weights of 27 levels around a voxel that give value (8, 27) and gradient (3, 8, 27) at octant centres."""
     side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
     towards = _AROUND[None] == side[:, None]
     share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
@@ -181,9 +181,10 @@ _VALUES, _SLOPES = _octant_weights()
 
 
 def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Return solid share and mean slope, [1 / voxel], of the voxels `index`, with a level linear in each octant.
+    """Return the solid share and the mean slope, [1 / voxel], of the voxels `index` for a level linear in each octant.
 
-    If a plane at distance d [voxels] from its middle cuts an octant, a share of 1/2 + 2 d is inside (on average).
+    `steps` (27,) lead from a voxel to its neighbours in the flat array `levels`. If the surface is a plane at distance
+    d [voxels] from an octant's middle, the share 1/2 + 2 d of the octant is solid (on average over directions).
     """
     share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
     for start in range(0, len(index), _CHUNK):
@@ -197,7 +198,10 @@ def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Floa
 
 
 def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
-    """Return means around voxels, weights 1 4 6 4 1 along each axis, of `values` with `at_index` written at `index`."""
+    """Return weighted means of `values` (flat) around the voxels `index`, weights 1 4 6 4 1 along each axis, (n,).
+
+    Before each pass, the values at `index` are replaced, in place, by `at_index` (n,).
+    """
     for _ in range(2):
         values[index] = at_index
         at_index = np.empty(len(index), dtype=np.float32)

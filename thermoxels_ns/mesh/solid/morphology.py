@@ -11,7 +11,7 @@ from thermoxels_ns.core.arrays import BoolArray
 
 
 def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
-    """Return slices of the box of all solid voxels and `margin` more on each side; the box is empty if none is solid.
+    """Return slices of the bounding box of solid voxels, wider by `margin` on each side; empty if no voxel is solid.
 
     >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
     (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
@@ -23,9 +23,9 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number, from 1 in C order of first voxels, 0 if empty.
+    """Return the label of each voxel's connected body, from 1 in C order of the bodies' first voxels; 0 if empty.
 
-    Voxels are one body if they share faces (`connectivity` 1), edges (2) or corners (3).
+    Voxels are connected if they share a face (`connectivity` 1), at least an edge (2) or at least a corner (3).
     """
     # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
@@ -45,9 +45,9 @@ def grow(cells: BoolArray, by: int) -> BoolArray:
 
 
 def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
-    """Return the voxels whose surrounding box of `size` voxels is completely solid and inside the array.
+    """Return the voxels whose surrounding box of `size` voxels is completely solid and inside the array (an erosion).
 
-    A box of even size is centred half a voxel below the voxel, or half a voxel above with `origin` -1.
+    A box of even size is centred half a voxel below the voxel, or half a voxel above it if `origin` is -1.
 
     >>> shrink(np.array([[[True, True, True, True]]]), (1, 1, 3))[0, 0].tolist()
     [False, True, True, False]
@@ -56,7 +56,7 @@ def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[in
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
-    """Return the solid voxels and all gaps too narrow for a cube of empty voxels with an edge of 2 `by` + 1 voxels.
+    """Return the closing of solid voxels: gaps too narrow for an empty cube of edge 2 `by` + 1 voxels are filled.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]
@@ -72,7 +72,7 @@ def close_gaps(cells: BoolArray, by: int) -> BoolArray:
 def convex_hull(cells: BoolArray) -> BoolArray:
     """Return the voxels whose centres lie in the convex hull of the centres of the solid voxels.
 
-    The hull meets each column of voxels in one interval, whose ends take one comparison per column and hull plane.
+    The hull meets each column of voxels in one interval; each hull plane is compared once with each column.
     """
     columns = np.argwhere(cells.any(axis=2))
     if len(columns) == 0:

@@ -34,19 +34,19 @@ Ball = Annotated[tuple[float, float, float, float], _AsTuple]
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) with less than this share of the largest body's voxels are removed."""
 FALLBACK_OPTICAL_DEPTH = 0.5  # least density times voxel edge of a solid voxel if there are too few rays to choose by
-SHARE_OF_RAYS = 0.95  # of the rays that end on something, the share that shall meet a solid voxel at their end
+SHARE_OF_RAYS = 0.95  # share of the rays that end on something that shall meet a solid voxel at their end
 OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
 """Bounds of the automatic threshold, as density times voxel edge. At the first, a ray needs 35 voxels to lose half of
 its light, as in half-transparent space. At the second, a single voxel stops half of the light, as a surface does."""
-OPAQUE_OPTICAL_DEPTH = 2.0  # at this density times voxel edge or more, a dense voxel is solid even if no ray ends in it
+OPAQUE_OPTICAL_DEPTH = 2.0  # a dense voxel of at least this density times voxel edge is solid even if no ray ends in it
 SHARE_THAT_ENDS = 0.5
-"""A voxel stops rays if the number of rays that end in it is more than this share of the weight that rays spent in it.
-The ratio of the two is 1 in a voxel where all rays that enter end, and 0 where light leaked past a surface."""
-LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its density alone decides
+"""A voxel stops rays if the number of rays that end in it exceeds this share of the weight that rays spent in it. The
+ratio of the two is 1 if all rays that enter the voxel end in it, and 0 if light only leaked past a surface."""
+LEAST_WEIGHT = 0.5  # if rays spent less weight than this in a voxel, [rays], its density alone decides
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
-NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
-SEAL = 2  # to find the interior, openings up to twice this many voxels wide count as closed
+NEAREST_SHARE = 0.25  # quantile of the distances to solid along these rays at which the camera is said to point
+SEAL = 2  # openings up to twice this many voxels wide count as closed when the interior is found
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
@@ -82,7 +82,7 @@ class SolidSelection:
 
 @dataclass(frozen=True)
 class SolidStep:
-    """The changes made by one of the steps that lead from density to solid voxels."""
+    """The changes that one step on the way from density to solid voxels made."""
 
     name: str  # threshold, close gaps, region, interior, surface, wall or close rooms
     added: int  # number of voxels that the step made solid
@@ -97,11 +97,11 @@ class SolidCells:
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
     dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
-    steps: tuple[SolidStep, ...]  # all in order; the first is the threshold, which says what rule chose it and why
+    steps: tuple[SolidStep, ...]  # all steps in order; the remark of the first says which rule chose the threshold
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
-    rooms: BoolArray | None  # True for empty voxels inside hollow walls of given thickness; None for other solids
-    distance: Float32Array | None = None  # Result of `distance_to_ends`; None: rays did not choose the voxels
+    rooms: BoolArray | None  # True for empty voxels enclosed by walls of given thickness; None if not asked for
+    distance: Float32Array | None = None  # Result of `distance_to_ends`; None if rays did not choose the threshold
 
 
 def select_solid(
@@ -110,10 +110,10 @@ def select_solid(
     metres_per_world_unit: float = 1.0,
     world_to_input: FloatArray | None = None,
 ) -> SolidCells:
-    """Return the solid voxels of a trained field, chosen by their density and then changed by further steps.
+    """Return the solid voxels of a trained field: voxels above a density threshold, changed by further steps.
 
-    `metres_per_world_unit` is used for a wall thickness only, which also needs the cameras. `world_to_input`, shape
-    (3, 4), maps world coordinates to those of the region's box or point; None is the identity.
+    `metres_per_world_unit` is used only for a wall thickness; the caller must then give a snapshot with cameras.
+    `world_to_input`, (3, 4), maps world coordinates to those of the region's box or ball; None is the identity.
 
     Raises:
         MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
@@ -190,7 +190,7 @@ def select_solid(
 
 
 def _large_bodies(cells: BoolArray, least: float) -> tuple[BoolArray, IntArray]:
-    """Return the voxels of bodies that have at least the share `least` of the largest one's, and the size of each."""
+    """Return the voxels of bodies of at least `least` times the largest body's size, and all sizes (b,), [voxels]."""
     labels = connected(cells)
     sizes = np.bincount(labels.ravel())[1:]
     return np.append(False, sizes >= least * sizes.max())[labels], sizes
@@ -207,13 +207,11 @@ class Threshold:
 
 
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
-    """Return the voxels that are dense enough by the rule of `selection`; `density` is given at voxel centres.
+    """Return the dense voxels by the rule of `selection`, and the threshold; `density` is given at voxel centres.
 
-    If no rule is asked for, the threshold lets the share `SHARE_OF_RAYS` of training rays end on dense voxels, within
-    `OPTICAL_DEPTH_BOUNDS`. With fewer than `FEWEST_RAYS` rays, it is `FALLBACK_OPTICAL_DEPTH` over the voxel edge.
-
-    Raises:
-        MeshError: A percentile above 0 is asked for, and all voxels have the same density.
+    If `selection` has no rule, the threshold is the highest, within `OPTICAL_DEPTH_BOUNDS`, at which the share
+    `SHARE_OF_RAYS` of training rays end on dense voxels. With fewer than `FEWEST_RAYS` rays, the threshold is
+    `FALLBACK_OPTICAL_DEPTH` divided by the voxel edge. Raises `MeshError` as `_densest_share`, if it is used.
     """
     evidence = snapshot.evidence
     if selection.density_threshold is not None:
@@ -231,14 +229,14 @@ def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSe
 
 
 def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) -> Threshold:
-    """Return the voxels that training rays end on; `voxel` is the edge of a voxel, [world units].
+    """Return the voxels that training rays end on, and the threshold; `voxel` is a voxel's edge, [world units].
 
-    A ray ends at the point where half of its weight is spent. The ray meets the densest voxel within half a voxel of
-    that point (`RayEvidence.half_depth_density`). The threshold is the highest density that a share `SHARE_OF_RAYS` of
-    the rays meet or exceed, kept within `OPTICAL_DEPTH_BOUNDS`: nearly all rays end on solid voxels.
+    A ray ends at the point at which half of its weight is spent. The ray meets the densest voxel within half a voxel of
+    that point (`RayEvidence.half_depth_density`). The threshold is the highest density that the share `SHARE_OF_RAYS`
+    of the rays meet or exceed, kept within `OPTICAL_DEPTH_BOUNDS`: nearly all rays end on solid voxels.
 
-    Voxels where rays spend weight but hardly any ray ends hold density from light that leaked past a surface. A few of
-    these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`.
+    Density in voxels in which rays spend weight but hardly end comes from light that leaked past a surface. These
+    voxels would thicken the body by a layer, so they are solid only from `OPAQUE_OPTICAL_DEPTH` on.
     """
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
@@ -257,10 +255,10 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
 
 
 def _densest_share(density: FloatArray, percentile: float) -> Threshold:
-    """Return the densest (100 - percentile) % of all voxels, as in the Thermoxels paper.
+    """Return the densest (100 - percentile) % of all voxels and the threshold, as in the Thermoxels paper.
 
-    Voxels as dense as the threshold are left out if there are denser ones, because training leaves the initial density
-    in space that no ray touches. Raises `MeshError` if all are equally dense.
+    Voxels exactly as dense as the threshold are left out if denser voxels exist, because training leaves the initial
+    density in space that no ray touches. Raises `MeshError` if `percentile` and all, equal, densities are above 0.
     """
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
@@ -278,7 +276,7 @@ def _densest_share(density: FloatArray, percentile: float) -> Threshold:
 def _region(
     cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
 ) -> tuple[BoolArray, str]:
-    """Return the voxels, solid or not, of the region asked for, and a sentence that describes the region."""
+    """Return a mask of the voxels, solid or not, of the region of `selection`, and a sentence that describes it."""
     box, near, views = selection.region_box, selection.region_near, snapshot.views
     if box is not None or near is not None:
         to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
@@ -293,9 +291,10 @@ def _region(
 
 
 def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
-    """Return the voxels, solid or not, that photographs show about as well as what the cameras were pointed at.
+    """Return a mask of voxels, solid or not, that photographs show about as well as the object they were taken of.
 
-    Rays through the middle of a camera's image end on what the camera was pointed at; `Views.shown_well` does the rest.
+    The solid `cells` that rays through the middle of a camera's image meet give the distance of this object;
+    `Views.shown_well` compares each voxel with it.
     """
     eyes, count = lattice.world_to_index(views.camera_to_world[:, :, 3]), len(views.focal)
     reach = np.full(count, np.nan)
@@ -321,7 +320,7 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
 def _asked_region(
     cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
 ) -> BoolArray:
-    """Return the voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is among these."""
+    """Return a mask of voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is in it."""
     # Each input coordinate is a sum of three terms, one per voxel index: one array per axis is enough.
     middles = [
         lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)

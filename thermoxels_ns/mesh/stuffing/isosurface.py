@@ -1,4 +1,4 @@
-"""Isosurface stuffing: tetrahedra that fill a solid up to the surface where a level on voxel centres is 0."""
+"""Isosurface stuffing: tetrahedra that fill a solid up to the zero surface of a level function on voxel centres."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
     *((1, corner) for corner in (2, 3, 4, 5)),
     *((2, 3), (3, 4), (4, 5), (5, 2)),
 )
-"""Numbers of the end points of a bundle's 13 edges, see `stencil_table`; the cut of edge e has number 6 + e."""
+"""The two end points of each of a bundle's 13 edges, see `stencil_table`; the cut of edge e has the number 6 + e."""
 BUNDLE_POINTS: FloatArray = np.array(
     [[0, 0, 0], [1, 0, 0], [0.5, -0.5, -0.5], [0.5, 0.5, -0.5], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5]]
 )
-"""Positions of a bundle's six points, [voxels]; the first coordinate is along the face's axis, then cyclically."""
+"""Positions of a bundle's six points, (6, 3), [voxels], along the axis across the face and then the next two axes."""
 NUM_BUNDLE_NODES = 19
 CODE_WEIGHTS: npt.NDArray[np.int16] = (3 ** np.arange(6)).astype(np.int16)
 """The code of a bundle is the sum of (sign + 1) times these weights over its six points."""
@@ -52,31 +52,28 @@ class StuffedSolid:
     """Positions of nodes, shape (n, 3), all different and used; coordinates are from 0 to the number of voxels."""
     tets: IntArray  # node numbers, shape (t, 4), positively oriented
     facets: IntArray  # boundary triangles, shape (f, 3); right-hand normals point out of the solid
-    on_box: BoolArray
-    """True for boundary triangles that lie exactly on a border plane of the voxel lattice, shape (f,)."""
+    on_box: BoolArray  # True for boundary triangles that lie exactly on a border plane of the voxel lattice, shape (f,)
 
 
 def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
-    """Return tetrahedra that fill the part of a voxel lattice where the interpolated level is above 0.
+    """Return tetrahedra that fill the part of a voxel lattice in which the interpolated level is above 0.
 
     This is isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a
-    body-centred cubic lattice. Its cubes have an edge of one voxel near the surface and double in size from there
+    body-centred cubic lattice. The lattice's cubes have an edge of one voxel near the surface, and their size doubles
     inwards. All dihedral angles are between 10.9 and 163.8 degrees for any levels, and between 45 and 120 degrees away
-    from the surface. The surface is the same for any size of the cells inside.
+    from the surface. The size of the cubes inside has no influence on the surface.
 
-    Errors of the surface are of second order in the voxel size where the level is linear over the voxels next to it.
-    If levels are clipped to -1 and 1, the clipping should begin at least 1.5 voxels from the surface: at 0.5 voxels the
+    Errors of the surface are of second order in the voxel size if the level is linear over the voxels next to it. If
+    levels are clipped to -1 and 1, the clipping should begin at least 1.5 voxels from the surface: at 0.5 voxels the
     area of a sphere is 1.5 % too large, and with levels of -1 and 1 alone 13 %. Sharp edges become chamfers half a
-    voxel wide. Solid voxels that share a face stay in one piece; walls and gaps of one voxel get no holes.
+    voxel wide. Solid voxels that share a face remain connected; walls and gaps of one voxel get no holes. If solid
+    voxels touch the border of the lattice, the mesh ends on the border.
 
     Args:
-        level: Levels at the voxel centres, above 0 in solid voxels, of which there is at least one, shape (cx, cy, cz).
-            Only their ratios matter.
-        coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all equal. Larger
-            cells than 4 save little, because most tetrahedra are at the surface.
-
-    Returns:
-        The mesh. Where solid voxels touch the border of the lattice, the mesh ends on the border.
+        level: Levels at the voxel centres, shape (cx, cy, cz), above 0 in solid voxels; at least one must be. Only the
+            ratios of levels have an influence.
+        coarsest: Edge of the largest cubes inside the solid, [voxels], a power of two; 1 makes all cubes equal. More
+            than 4 saves little, because most tetrahedra are at the surface.
 
     >>> solid = stuff(np.ones((1, 1, 1)))
     >>> len(solid.points), len(solid.tets), len(solid.facets), bool(solid.on_box.all())
@@ -100,12 +97,12 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The mesh's nodes in order: points inside with cut edges, other points inside, points on the surface, cuts."""
+    """Nodes of the mesh in this order: inner points with cut edges, other inner points, points on the surface, cuts."""
 
     points: FloatArray  # positions, shape (n, 3)
     of_point: npt.NDArray[np.integer]  # node number of every lattice point, -1 for points that are no node
-    of_cut: npt.NDArray[np.integer]  # node number of the cut on each edge of each `cut_points`, -1 if uncut
-    num_inside: int  # number of nodes strictly inside, which come first
+    of_cut: npt.NDArray[np.integer]  # node number of the cut on each edge of each of `cut_points`, (s, 14); -1 if uncut
+    num_inside: int  # number of nodes strictly inside; they are the first nodes
 
 
 def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseInterior) -> _Nodes:
@@ -138,14 +135,14 @@ def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseIn
 
 @dataclass(frozen=True)
 class _Bundles:
-    """Bundles of one axis: each is a voxel face across the axis with its four tetrahedra, see `stencil_table`."""
+    """Bundles of one axis: each bundle is the four tetrahedra at a voxel face across the axis, see `stencil_table`."""
 
     points: IntArray  # flat lattice indices of the six points of each bundle, shape (6, b)
-    directions: IntArray  # row in `DIRECTIONS` of each edge, from its first and its second end, (13, 2)
+    directions: IntArray  # row in `DIRECTIONS` of each edge as seen from its first and from its second end, (13, 2)
 
 
 def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8], interior: CoarseInterior) -> Iterator[_Bundles]:
-    """Yield, in chunks, all bundles with a point inside the solid, except bundles in or between larger cubes."""
+    """Yield in chunks all bundles that have a point inside the solid and do not lie in or between larger cubes."""
     inner = sign > 0
     first, second = np.array(BUNDLE_EDGES).T
     for axis in range(3):
@@ -192,10 +189,11 @@ def _fill_bundles(bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes) 
 
 @cache
 def stencil_table() -> tuple[IntArray, IntArray]:
-    """Return tetrahedra for all bundle codes (`CODE_WEIGHTS`), (t, 4), positively oriented, and each code's first row.
+    """Return the tetrahedra of all bundle codes (`CODE_WEIGHTS`), (t, 4), and the first row of each code, (3^6 + 1,).
 
-    A bundle is the four lattice tetrahedra around the long edge from the voxel centre below a voxel face to the centre
-    above it; each of them holds one side of the face. Points and cuts of a bundle are numbered
+    The tetrahedra are positively oriented. A bundle is the four lattice tetrahedra around the long edge from the voxel
+    centre below a voxel face to the centre above it. Each of them contains one side of the face. Points and cuts of a
+    bundle are numbered
 
         0, 1           centre below and above the face
         2 .. 5         the face's corners, counter-clockwise seen from above
@@ -204,7 +202,7 @@ def stencil_table() -> tuple[IntArray, IntArray]:
         11 .. 14       the cuts of edges 1-2, 1-3, 1-4, 1-5
         15 .. 18       the cuts of the face's sides 2-3, 3-4, 4-5, 5-2
 
-    The numbers serve faces across all three axes, because turning x, y, z into y, z, x leaves the lattice as it is.
+    The table is valid for faces across all three axes, because the lattice is the same after x, y, z become y, z, x.
     """
     tets, start = [], [0]
     # The first sign varies fastest, as in `CODE_WEIGHTS`.
@@ -219,7 +217,8 @@ def stencil_table() -> tuple[IntArray, IntArray]:
 
 @cache
 def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
-    """Return the tetrahedra in the solid part of a lattice tetrahedron (stencils of Labelle and Shewchuk 2007)."""
+    """Return tetrahedra that fill the solid part of a lattice tetrahedron (stencils of Labelle and Shewchuk 2007).
+    `points` are four points of a bundle; `signs` are their signs: 1 inside the solid, 0 on its surface, -1 outside."""
     plus = [v for v, sign in zip(points, signs) if sign > 0]
     zero = [v for v, sign in zip(points, signs) if sign == 0]
     minus = [v for v, sign in zip(points, signs) if sign < 0]
@@ -246,7 +245,8 @@ def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
 
 
 def _fill_prism(top: tuple[int, ...], bottom: tuple[int, ...], before: set[tuple[int, int]]) -> list[_Tet]:
-    """Cut a prism into three tetrahedra; (m, n) in `before`: a diagonal goes from top corner m to bottom corner n."""
+    """Return three tetrahedra that fill a prism between two triangles, `top` and `bottom`. A pair (m, n) in `before`
+    says that the diagonal of a side goes from top corner m to bottom corner n."""
     for order in permutations(range(3)):
         if all(order.index(m) < order.index(n) for m, n in before):
             i, j, k = order
@@ -259,12 +259,13 @@ def _fill_prism(top: tuple[int, ...], bottom: tuple[int, ...], before: set[tuple
 
 
 def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
-    """Order the two inner points of a face so that its diagonal goes from the first point to the cut of the second.
+    """Return the inner points `a` and `b` of a face in the order in which the face's diagonal uses them.
 
-    The rule depends on the face alone, so both tetrahedra that share the face agree (Labelle and Shewchuk 2007, section
-    3). If the inner points are joined by a short edge, the diagonal ends at the cut of the long edge. If they are
-    joined by a long edge, the diagonal starts at its lower end if an odd number of coordinates of `outside` is above
-    those of the lower end, else at its upper end. The diagonals of a prism then never form a cycle.
+    The diagonal goes from the first point to the cut between the second point and `outside`. The rule depends on the
+    face alone, so both tetrahedra at the face agree (Labelle and Shewchuk 2007, section 3). If a short edge joins a and
+    b, the diagonal ends at the cut of the long edge. If a long edge joins them, count the coordinates of `outside` that
+    are above the lower end's: for an odd number the diagonal starts at the lower end, else at the upper end. The
+    diagonals of a prism then never form a cycle.
     """
     along = BUNDLE_POINTS[b] - BUNDLE_POINTS[a]
     if np.abs(along).max() < 1.0:
@@ -276,7 +277,8 @@ def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
 
 
 def _oriented(tet: tuple[int, ...]) -> _Tet:
-    """Return a tetrahedron with positive orientation, computed with all cuts in the middle of their edges."""
+    """Return a tetrahedron of bundle points and cuts, its last two nodes exchanged if its volume is negative. The
+    volume is computed with each cut at the middle of its edge, as cuts elsewhere do not change the sign."""
     middles = [0.5 * (BUNDLE_POINTS[a] + BUNDLE_POINTS[b]) for a, b in BUNDLE_EDGES]
     corners = np.concatenate([BUNDLE_POINTS, middles])[list(tet)]
     a, b, c, d = tet

@@ -1,4 +1,4 @@
-"""The body-centred cubic lattice of isosurface stuffing: its levels, its moved points and its cubes deep inside."""
+"""The body-centred cubic lattice of isosurface stuffing: levels, points moved to the surface, larger cubes inside."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ DIRECTIONS: FloatArray = np.concatenate([_AXES, _DIAGONALS])
 """Steps to the 14 neighbours, shape (14, 3), [voxels]: +x, -x, +y, -y, +z, -z, then the diagonals (---) to (+++)."""
 LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)  # lengths of the 14 edges, [voxels]
 OPPOSITE: IntArray = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
-"""For each row of `DIRECTIONS` the number of the row that points the opposite way, shape (14,)."""
+"""Row of `DIRECTIONS` that points opposite to each row, shape (14,)."""
 
 
 @dataclass(frozen=True)
 class BccLattice:
-    """A body-centred cubic lattice over the solid part of a voxel lattice, with a level on every point.
+    """A body-centred cubic lattice over the solid part of a voxel lattice, with a level at every point.
 
     The points are the voxel centres and the voxel corners. Each point has 14 neighbours. Six are of its own kind, along
     the axes (long edges, 1 voxel). Eight are of the other kind, along the space diagonals (short edges, sqrt(3)/2
-    voxels). The points are numbered by a flat index: first a block of centres, then a block of corners, both padded to
-    the same shape, so that a step along an edge adds the same number to the flat index of all centres or all corners.
+    voxels). Points have a flat index: first a block of centres, then a block of corners, both padded to the same shape.
+    A step along an edge therefore adds one number to the flat index of all centres, and one to that of all corners.
     """
 
-    level: npt.NDArray[np.floating]  # level of every point, flat; above 0 is solid; no point of the padding is solid
+    level: npt.NDArray[np.floating]  # level of every point, flat, above 0 in the solid; the padding is never solid
     shape: tuple[int, int, int]  # shape of each of the two padded blocks, centres and corners
     first_cell: IntArray  # index of the voxel whose centre has index (1, 1, 1) in its block
 
     @property
     def num_centres(self) -> int:
-        """Return the number of points in the block of centres, which is the flat index of the first corner."""
+        """Number of points in the block of centres; also the flat index of the first corner."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     @property
     def strides(self) -> tuple[int, int, int]:
-        """Return the numbers that a step of one voxel along x, y and z adds to the flat index."""
+        """Numbers that a step of one voxel along x, y and z adds to the flat index."""
         return (self.shape[1] * self.shape[2], self.shape[2], 1)
 
     @cached_property
     def offsets(self) -> IntArray:
-        """Return what a step to each neighbour adds to the flat index of a centre and of a corner, shape (2, 14)."""
+        """Numbers that a step to each neighbour adds to the flat index of a centre and of a corner, shape (2, 14)."""
         strides = np.array(self.strides)
         along = DIRECTIONS[:6].astype(np.int64) @ strides
         # Centre i of the first block lies half a voxel below corner i of the second, along each axis.
@@ -83,12 +83,12 @@ class BccLattice:
 
 
 def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
-    """Return the body-centred lattice of levels at voxel centres, shape (cx, cy, cz), at least one of them above 0.
+    """Return the body-centred lattice of levels at voxel centres, shape (cx, cy, cz); at least one must be above 0.
 
-    A corner gets the mean level of the eight centres around it, which is the trilinear value, or 0 where the mean would
-    make a hole in a layer of one voxel. Where solid touches the border of the voxel lattice, the surface is on the
-    border: each centre in the padding has the level -|level| of the centre inside, and corners on the border are at
-    most 0. The lattice covers the bounding box of the solid voxels and two voxels more to each side.
+    A corner gets the mean level of the eight centres around it (the trilinear value), or 0 if the mean would make a
+    hole in a layer of one voxel. If solid touches the border of the voxel lattice, the surface lies on the border: each
+    centre in the padding gets -|level| of the centre inside, and corners on the border are at most 0. The lattice
+    covers the bounding box of the solid voxels and two voxels more on each side.
     """
     box = bounding_box(level > 0.0, margin=2)
     first, inner = np.array([part.start for part in box]), level[box]
@@ -115,10 +115,11 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
 
 
 def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floating]) -> None:
-    """Raise corners to 0 where a solid layer of one voxel would get holes; lower them to 0 where a gap of one would.
+    """Set corners to 0, in place, that would make a hole in a solid layer, or a bridge over a gap, one voxel thick.
 
     The middle of a square of four solid centres lies on the long edge between the corners above and below. If neither
-    corner is above 0, the square is a hole, unless both are exactly 0. Likewise for gaps and squares of empty centres.
+    corner is above 0, the square is a hole unless both are exactly 0. Squares of empty centres in a gap are treated
+    alike, with the opposite sign.
     """
     solid = centres > 0.0
     for layer, side in ((~solid, -1.0), (solid, 1.0)):
@@ -136,17 +137,17 @@ def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floa
 
 
 ALPHA_INSIDE = np.where(LENGTHS == 1.0, 0.272, 0.397)
-"""Distance within which a cut pulls a point inside the solid onto the surface, as a share of the edge, shape (14,)."""
+"""Largest distance of a cut that moves a point inside the solid onto the surface, as a share of the edge, (14,)."""
 ALPHA_OUTSIDE = np.where(LENGTHS == 1.0, 0.282, 0.369)
-"""Distance within which a cut pulls a point outside the solid onto the surface, as a share of the edge, shape (14,).
+"""The same for points outside the solid, shape (14,).
 
-With these four numbers all dihedral angles are between 10.94 and 163.74 degrees: the extremes over all stencils, with
-every cut and every moved point at every end of its range. Labelle and Shewchuk (2007) give one pair for both sides.
+With these four numbers all dihedral angles are between 10.94 and 163.74 degrees, the extremes over all stencils with
+each cut and moved point at each end of its range. Labelle and Shewchuk (2007) give one pair of numbers for both sides.
 """
 
 
 def _contractible_links() -> BoolArray:
-    """Return for every set of neighbours, numbered by 14 bits, whether it can be shrunk to a point, shape (2^14,)."""
+    """Return whether each set of a point's 14 neighbours can be shrunk to a point, (2^14,); bits number the sets."""
     # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if both the
     # part and the rest of the sphere are one piece, and neither is empty.
     steps = DIRECTIONS[:, None, :] - DIRECTIONS[None, :, :]
@@ -169,7 +170,7 @@ _CONTRACTIBLE = _contractible_links()
 
 @dataclass(frozen=True)
 class WarpedLattice:
-    """A lattice after the points close to the surface were moved onto it, and the cuts that are left on its edges."""
+    """A lattice whose points close to the surface were moved onto it, and the cuts that are left on its edges."""
 
     sign: npt.NDArray[np.int8]  # +1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice
     moved: IntArray  # points that moved, shape (m,)
@@ -177,19 +178,20 @@ class WarpedLattice:
     inner: IntArray  # points with sign +1 that are not buried, ascending; shape (p,)
     cut_points: IntArray  # points of `inner` with at least one cut edge, ascending; shape (s,)
     cuts: FloatArray
-    """Distance from each cut point to the cut, as a share of the edge length; NaN on edges without; shape (s, 14)."""
+    """Distance from each cut point to the cut of each edge, as a share of the edge; NaN on uncut edges, (s, 14)."""
 
 
 def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
-    """Return the lattice after points close to the surface were moved onto it, and the cuts that are left on edges.
+    """Return the lattice with points close to the surface moved onto it, and the cuts that are left on edges.
 
-    Between a point inside and one outside, the cut is where the linearly interpolated level is 0. A point with cuts
-    nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and gets sign 0, and its
-    edges are cut no more (Labelle and Shewchuk 2007, section 3). `buried` points and their neighbours are all inside.
+    The cut of an edge between a point inside and a point outside is the zero of the linearly interpolated level. A
+    point that has cuts nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and
+    gets sign 0; its edges are then uncut (Labelle and Shewchuk 2007, section 3). `buried` is True for points that are
+    inside together with all their neighbours; they are skipped.
 
-    Beyond the paper, thin parts are kept: an inside point stays if the point on its far side, away from the nearest
-    cut, is not inside, or if moving it could split, close or remove the solid there; the same holds for outside points
-    and gaps. Cuts left are then put at least alpha edge lengths from both ends, within the paper's bounds on angles.
+    Beyond the paper, thin parts are kept. An inside point does not move if its neighbour opposite to the nearest cut is
+    not inside, or if the move could split, close or remove the solid there. Outside points and gaps are treated alike.
+    The cuts that are left are then moved to at least alpha edge lengths from both ends, within the bounds on angles.
     """
     level = lattice.level
     sign = (level > 0.0).astype(np.int8)
@@ -243,7 +245,7 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
 
 
 def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray) -> FloatArray:
-    """Return the distance from points to the cuts of their edges, as a share of the edge, inf where uncut, (n, 14)."""
+    """Return the distance from points to the cuts of their edges, as a share of the edge, (n, 14); inf if uncut."""
     neighbours = lattice.neighbours(points)
     own = lattice.level[points].astype(np.float64)
     other = lattice.level[neighbours].astype(np.float64)
@@ -260,11 +262,11 @@ _OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
-    """Return the cubes with edges of 2, 4, 8, ... `largest` voxels into which the voxels of a set can be joined.
+    """Return a balanced octree: the cubes of 2, 4, 8, ... `largest` voxels into which the voxels of a set are joined.
 
-    Entry n of the result is an array over all cubes with an edge of 2^(n + 1) voxels, True where nothing in the cube is
-    smaller. Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at
-    most by a factor 2 in size; voxels outside the set count as cubes of one voxel. Cubes are as large as this allows.
+    Entry n is a mask over all cubes of edge 2^(n + 1) voxels, True for cubes that hold no smaller cube. Cube (i, j, k)
+    of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at most by a factor 2 in
+    size, and are as large as this allows. Voxels outside the set count as cubes of one voxel.
 
     >>> [np.count_nonzero(level) for level in balanced_octree(np.ones((12, 12, 12), dtype=bool), 8)]
     [216, 1]
@@ -285,35 +287,35 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
 
 
 def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
-    """Return the values `level` of cubes copied to the eight cubes of half the edge in each, cut to `shape`."""
+    """Return the values `level` of cubes copied to the eight half-size cubes in each, cropped to `shape`."""
     return np.kron(level, np.ones((2, 2, 2), dtype=bool))[tuple(slice(n) for n in shape)]
 
 
 @dataclass(frozen=True)
 class CoarseInterior:
-    """Tetrahedra of cubes of two voxels and more, in place of the uniform lattice's tetrahedra deep inside a solid."""
+    """Tetrahedra of cubes of at least two voxels, which replace those of single voxels deep inside a solid."""
 
     covered: BoolArray  # True for voxels inside a larger cube, one entry per point of the block of centres, flat
-    tets: IntArray  # flat indices, shape (t, 4), positively oriented: all tetrahedra at faces of larger cubes
+    tets: IntArray  # all tetrahedra at faces of larger cubes, as flat indices of points, (t, 4), positively oriented
 
     def buried(self, lattice: BccLattice) -> BoolArray:
-        """Return True for lattice points with only voxels of larger cubes around them, shape (points,).
+        """Return True for lattice points around which all voxels belong to larger cubes, shape (points,).
 
-        These points and all their neighbours are inside the solid; no neighbour is moved or has a cut edge.
+        These points and their neighbours are inside the solid; `warp` moves none of them and cuts none of their edges.
         """
         corners = shrink(self.covered.reshape(lattice.shape), 2, -1)
         return np.concatenate([self.covered, corners.reshape(-1)])
 
 
 def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior:
-    """Fill the deep inside of a solid with tetrahedra from cubes with edges of two to `largest` voxels.
+    """Return tetrahedra from cubes with edges of two to `largest` voxels, which fill the deep inside of a solid.
 
-    Every cube has nodes at its centre and its corners, which are points of the body-centred cubic lattice. Two
-    neighbours of the same size share a face: each of the face's four sides makes a tetrahedron with the edge between
-    the two centres. A side that smaller cubes touch has a node in its middle, which cuts its tetrahedron in two. Two
-    neighbours of different sizes share the smaller cube's face: its diagonal through the middle of the larger face cuts
-    it into two triangles, and each triangle makes a tetrahedron with either centre (Labelle and Shewchuk 2007). The
-    octree begins at the lowest voxel that may be joined, so results do not depend on where in the lattice the solid is.
+    The nodes are centres and corners of cubes, which are points of the body-centred cubic lattice (Labelle and Shewchuk
+    2007). Two neighbours of the same size share a face. Each of the face's four sides makes a tetrahedron with the edge
+    between the two centres. If smaller cubes touch a side, the node in its middle divides this tetrahedron in two. Two
+    neighbours of different sizes share the smaller cube's face. The face's diagonal through the middle of the larger
+    face cuts it into two triangles, and each triangle makes a tetrahedron with each centre. The octree begins at the
+    lowest voxel that may be joined, so results do not depend on the position of the solid in the lattice.
     """
     deep = _far_from_surface(lattice)
     box = bounding_box(deep)
@@ -332,7 +334,7 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior:
 
 
 def _far_from_surface(lattice: BccLattice) -> BoolArray:
-    """Return voxels with no moved point and no cut edge in the tetrahedra at their faces, shape `lattice.shape`."""
+    """Return a mask of voxels whose faces' tetrahedra have no moved point and no cut edge, shape `lattice.shape`."""
     # A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the six centres next to it
     # must be inside, and all neighbours of these points must not be outside: the centres two steps along faces away,
     # the corners of the six voxels beside it, and the centres of all voxels that touch it.
@@ -344,11 +346,11 @@ def _far_from_surface(lattice: BccLattice) -> BoolArray:
 
 
 def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, BoolArray, BoolArray]]:
-    """Yield edge, [voxels], and two masks of the cubes of every size, over all their places and one more on each side.
+    """Yield for each size of cubes, from single voxels up, the edge, [voxels], and two masks of the cubes.
 
-    Single voxels come first; all places outside the octree count as such. The first mask is True where nothing inside
-    the cube is smaller (whole), the second where the cube is part of a larger one (joined). The cubes of the octree are
-    whole and not joined (single).
+    The first mask is True for cubes that hold no smaller cube (whole), the second for cubes that are part of a larger
+    one (joined). Cubes of the octree are whole and not joined (single). Masks have one more place on each side; places
+    outside the octree count as single voxels.
     """
     whole = np.ones([n + 2 for n in shape], dtype=bool)
     for number in range(len(octree) + 1):
@@ -368,7 +370,7 @@ class _Points:
     origin: int  # flat index of the lowest corner of cube (0, 0, 0)
     per_cube: IntArray  # flat steps from a cube to the next along x, y, z
     centre: int  # flat step from a cube's lowest corner to its centre
-    ahead: int  # flat step from a cube to the next along the axis
+    ahead: int  # flat step from a cube to its next neighbour along the axis
     corners: IntArray  # flat steps from a cube's lowest corner to the corners of its low face across the axis, (4,)
 
     @classmethod
@@ -388,7 +390,7 @@ class _Points:
 
 
 def _between_equals(whole: BoolArray, single: BoolArray, axis: int, points: _Points) -> Iterator[IntArray]:
-    """Yield the tetrahedra (t, 4) between each cube and the next along the axis, if both are single."""
+    """Yield the tetrahedra (t, 4) between each two neighbours along the axis that are both True in `single`."""
     two, ahead = [1, 1, 1], [0, 0, 0]  # a box of a cube and the next along the axis
     two[axis], ahead[axis] = 2, -1
     pairs, whole = (shrink(mask, tuple(two), tuple(ahead)) for mask in (single, whole))

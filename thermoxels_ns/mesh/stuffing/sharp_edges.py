@@ -1,4 +1,4 @@
-"""Sharpening: moves nodes of the chamfers that isosurface stuffing makes back to the sharp edges of the solid."""
+"""Sharpening: nodes of the chamfers that isosurface stuffing makes are moved back to the sharp edges of the solid."""
 
 from __future__ import annotations
 
@@ -14,34 +14,32 @@ from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
 ANGLES_DEG = (13.0, 160.0)
-"""Range of the dihedral angles after a move, [degrees]; it is narrower than the range of stuffing itself."""
+"""Range of the dihedral angles allowed after a move, [degrees]; it is narrower than the range of stuffing itself."""
 LONGEST_MOVE = 1.0  # nodes farther than this from the edge or corner do not move, [voxels]
 LEAST_SPREAD = 0.14
-"""Least eigenvalue, of the mean of n n^T over the triangles near a node, of a direction in which the node may move. Two
-planes whose normals n are 45 degrees apart have 0.15 as the second one; a pipe with a radius of 5 voxels has 0.03."""
+"""A node may move along an eigenvector of the mean of n n^T, over the normals n of triangles near it, if its eigenvalue
+is above this. The second eigenvalue is 0.15 for two planes at 45 degrees, and 0.03 for a pipe of radius 5 voxels."""
 MOST_RESIDUAL = 0.25
-"""Largest distance between the goal of a move and the planes of the triangles near the node, [voxels] (root mean
-square). It is larger where the surface is curved or noisy."""
-_CLEARANCE = 2.5
-"""A node does not move towards another surface that faces it and is nearer than this, [voxels]."""
+"""Largest root mean square distance of a goal from the planes near it, [voxels]; curved, noisy surfaces exceed it."""
+_CLEARANCE = 2.5  # a node does not move towards a surface that faces it and is nearer than this, [voxels]
 _FLAT_DEG = 8.0  # a node is flat if the normals of its triangles spread by less than this, [degrees] (root mean square)
-_REACH = 3.0  # planes are fitted to flat triangles within this distance of a node, [voxels]
-_NEAREST = 48  # of these, at most so many, the nearest, are used
-_FARTHEST = 1.2  # of these, triangles whose plane is farther than this from the node are not used, [voxels]
-_LEAST_FACETS = 12  # least number of such triangles
+_REACH = 3.0  # flat triangles within this distance of a node are used, [voxels]
+_NEAREST = 48  # of these triangles, at most this number, the nearest, are used
+_FARTHEST = 1.2  # triangles whose plane is farther than this from the node are not used, [voxels]
+_LEAST_FACETS = 12  # a node does not move if fewer triangles than this are left
 _CHUNK = 1 << 10  # number of nodes worked on at a time, so that their data stay in the processor's cache
 
 
 def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
-    """Return the mesh with nodes of chamfers moved to the edge or corner where the planes beside the chamfer meet.
+    """Return the mesh with nodes of chamfers moved to the edge or corner in which the planes beside the chamfer meet.
 
-    Where two planes of the surface meet, stuffing leaves a chamfer about half a voxel wide. A node moves to the point
-    with the least squares of distances to the planes of the flat triangles within three voxels (`_goals`). Where these
-    do not agree on an edge, as on smooth or noisy surfaces and on walls of less than 3 voxels, nothing moves. Nodes
-    move one after another, to corners first, then by the length of the move; a node moves only if all its tetrahedra
-    stay sound (`ANGLES_DEG`, volume above 0). Nodes on the border of the lattice, and nodes that face another surface
-    close by, stay. For boxes 48 voxels across, at any angle, the area is then within 0.5 % instead of 3.2 %. `shape` is
-    the number of voxels along each axis.
+    Stuffing leaves a chamfer about half a voxel wide at an edge of two planes. Each node moves to the least squares
+    point of the planes of the flat triangles within three voxels (`_goals`). If these planes do not agree on an edge,
+    as on smooth or noisy surfaces and on walls thinner than 3 voxels, the node does not move. Moves are made one after
+    another: to corners first, then from short to long. A move is made only if each tetrahedron at the node keeps a
+    volume above 0 and angles in `ANGLES_DEG`. Nodes on the border of the lattice, and nodes close to another surface
+    that faces them, do not move. The area of boxes 48 voxels wide, at any angle, is then within 0.5 % instead of 3.2 %.
+    `shape` is the number of voxels along each axis.
     """
     assert solid.points.min() >= 0.0 and np.all(solid.points.max(axis=0) <= shape)
     surface = Surface.of(solid)
@@ -64,7 +62,8 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 
 
 def _clear(surface: Surface, node: IntArray, to: FloatArray) -> BoolArray:
-    """Return which moves are allowed, (m,): an outward move is not if a surface faces the node within `_CLEARANCE`."""
+    """Return a mask (m,) of allowed moves of nodes `node` (m,) to places `to` (m, 3). An outward move is not allowed
+    if, within `_CLEARANCE` in front of the node, another surface faces the node."""
     clear, start = np.ones(len(node), dtype=bool), surface.points[node]
     others = np.unique(surface.facets)
     pairs = KDTree(start).sparse_distance_matrix(KDTree(surface.points[others]), _CLEARANCE, output_type="ndarray")
@@ -78,7 +77,8 @@ def _clear(surface: Surface, node: IntArray, to: FloatArray) -> BoolArray:
 
 
 def _carry_out(points: FloatArray, tets: IntArray, node: IntArray, to: FloatArray) -> FloatArray:
-    """Return positions (n, 3) after the moves, made in order, except moves after which a tetrahedron is not sound."""
+    """Return positions (n, 3) after the moves of nodes `node` (m,) to places `to` (m, 3), made in this order. A move is
+    left out if a tetrahedron is not sound after it (`_sound`), or if the node has moved already."""
     points, moved, near, moves = points.copy(), np.zeros(len(points), dtype=bool), tets, np.arange(len(node))
     while len(moves):
         # Moves that are the first one left at all tetrahedra around their node are made at once.
@@ -100,7 +100,7 @@ def _carry_out(points: FloatArray, tets: IntArray, node: IntArray, to: FloatArra
 
 
 def _sound(points: FloatArray, tets: IntArray) -> BoolArray:
-    """Return whether tetrahedra have a volume above 0 and dihedral angles within `ANGLES_DEG`, shape (t,)."""
+    """Return True for tetrahedra with a volume above 0 and all dihedral angles within `ANGLES_DEG`, shape (t,)."""
     (high, low), cosines = np.cos(np.radians(ANGLES_DEG)), dihedral_cosines(points, tets)
     return np.all((low <= cosines) & (cosines <= high), axis=1) & (signed_volumes(points, tets) > 0.0)
 
@@ -135,11 +135,11 @@ class Surface:
 def _goals(
     surface: Surface, nodes: IntArray, tree: KDTree, centroids: FloatArray, facets: IntArray
 ) -> Iterator[tuple[IntArray, FloatArray, BoolArray, FloatArray]]:
-    """Yield nodes that may move, their goals (m, 3), which goals are corners, and distances, [voxels]: edges, corners.
+    """Yield moves to edges, then to corners: nodes (m,), goals (m, 3), True for corners (m,), lengths (m,), [voxels].
 
-    The goal is the nearest point with the least squares of distances to the planes of flat triangles near the node (a
-    quadric; Garland and Heckbert 1997): a point of an edge, or, where normals spread in three directions, a corner.
-    `tree` holds the `centroids` of the flat triangles, whose numbers are `facets`.
+    The goal minimises the weighted sum of squared distances to the planes of flat triangles near the node (a quadric;
+    Garland and Heckbert 1997). It is the nearest such point of an edge or, if normals spread in three directions, a
+    corner. `nodes` are the candidates, `facets` the numbers of the flat triangles, `tree` and `centroids` their places.
     """
     distance, found = map(np.asarray, tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH))
     usable = np.isfinite(distance)
@@ -165,7 +165,7 @@ def _goals(
 
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Return for each node the sum of `values`, one per triangle, over the triangles around the node, (count,)."""
+    """Return for each of `count` nodes the sum, (count,), of `values` (f,) over the triangles `facets` around it."""
     total = np.zeros(count)
     for column in facets.T:
         total += np.bincount(column, values, count)
