@@ -41,9 +41,9 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
 class _Boundary(ABC):
     """The k boundary triangles on which an effect acts, and integrals over these triangles.
 
-    The arguments `relative_k` are temperatures of all unknowns, (n,), [K], minus the reference `reference_c`, so that
-    round-off is relative to differences. Heat flows of triangles are evaluated like the load, so that balances close.
-    The number q of integration points per triangle is 3 (the nodes) with linear tetrahedra.
+    The arguments `relative_k` are temperatures of all n unknowns minus `reference_c`, (n,), [K]; round-off is then
+    relative to differences. Heat flows of triangles are evaluated like the load, so that heat balances close. The
+    number q of integration points per triangle is 3 (the nodes) with linear tetrahedra.
     """
 
     def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:

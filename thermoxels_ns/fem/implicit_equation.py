@@ -42,8 +42,8 @@ is slow to set up, but its number of iterations hardly depends on the mesh size,
 PATIENCE_WHEN_REPEATED = 800  # Later solves begin with multigrid if a solve took more iterations than this
 MOST_ITERATIONS = 300  # Largest number of iterations with multigrid, which takes 15 to 50 if it helps
 LAST_ITERATIONS = 20_000
-"""Largest number of iterations with the diagonal after multigrid failed. On quadratic tetrahedra 100 times as long as
-high, multigrid stalls and the diagonal does not."""
+"""Largest number of iterations with the diagonal after multigrid failed, as on quadratic tetrahedra 100 times as long
+as high."""
 _PER_UNKNOWN = 10  # Largest number of these last iterations per unknown; without round-off one would be enough
 
 
@@ -289,7 +289,7 @@ class ImplicitEquation:
         return sparse.csr_matrix(matrix[fixed.free][:, fixed.free]) if len(fixed.nodes) else matrix
 
     def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
-        """Return the residual at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
+        """Return the residual at the temperatures `start_k` + `change_k`, (n,), [K]; `given_w` as in `solve`."""
         system, now_k = self._system, start_k + change_k
         conducted_w, parts_w = system.conducted_heat(now_k), system.exchange_parts(now_k, time_s)
         if np.isfinite(self._step_s):

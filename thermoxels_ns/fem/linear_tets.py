@@ -140,8 +140,8 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     """Return a uniform refinement: a conforming mesh of the same body with eight tetrahedra in place of each.
 
     The four corners of a tetrahedron become children of the same shape. The octahedron between them is cut into four
-    along the shortest of its three diagonals, as scikit-fem does. Children of the six tetrahedra of a cube (Kuhn) are
-    such tetrahedra as well, so no angle becomes obtuse.
+    along the shortest of its three diagonals, as scikit-fem does. Children of Kuhn tetrahedra, six of which fill a
+    cube, are Kuhn tetrahedra, so no angle becomes obtuse.
 
     Nodes keep their numbers; the midpoints of edges follow in the order of `mesh_edges`. Children have the order,
     regions, tags and patches of their parents. Temperatures and colours of new nodes are means, and a new node counts

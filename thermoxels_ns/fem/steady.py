@@ -68,8 +68,7 @@ def solve_steady(
 
 
 def out_of_range(beyond_k: float) -> tuple[float, str]:
-    """Return `beyond_k`, the distance of temperatures outside their range, [K], and a sentence on it. The result is (0,
-    "") for a distance up to `OVERSHOOT_K`."""
+    """Return `beyond_k`, [K], by which temperatures leave their range, and a sentence; (0, "") up to `OVERSHOOT_K`."""
     if beyond_k <= OVERSHOOT_K:
         return 0.0, ""
     said = f" A temperature left its range by up to {beyond_k:.2g} K: the mesh or the steps do not resolve a jump."

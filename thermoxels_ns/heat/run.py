@@ -93,7 +93,7 @@ class HeatRun(HasTables):
     nodes: SolutionNodes  # All temperatures of the solution, on a mesh with a node for each unknown
     left_out: tuple[LeftOut, ...]  # Effects that were left out because they bring too little heat
     accuracy: ToleratedSolution | None  # Solution with estimated errors; None if no tolerance was given
-    warnings: tuple[str, ...]  # Sentences on what looks wrong about the scene on this mesh
+    warnings: tuple[str, ...]  # Sentences on suspicious facts about the scene on this mesh
     unfit: tuple[str, ...]  # Entries of `warnings` that make heat losses and U-values worthless, such as no rooms
     layers: tuple[Layer, ...]  # Layers that `with_layers` added for `behind_m2k_w`
     solution: Solution  # Temperatures and heat flows

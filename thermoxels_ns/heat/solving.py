@@ -103,7 +103,7 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     """Return the numbers of the weakest effects, which together have at most `share` of the power of the others.
 
     An effect's power is its largest heat flow if the whole body has the coldest, or the warmest, temperature of start
-    and surroundings. If any effect changes with time, the result is empty, because heat between kept times is unknown.
+    and surroundings. The result is empty if any effect changes with time, because heat between kept times is unknown.
     """
     if time is not None and any(effect.changing for effect in problem.effects):
         return []

@@ -37,8 +37,7 @@ def read_weather(
     Args:
         path: A csv file or, if the name ends in .epw, an .epw file. The first line of a csv file names hours and
             columns; its user chooses hour 0. Values of an .epw file belong to the ends of its hours.
-        start: Time of hour 0 in an .epw file, in the standard time of its place if it has no time zone; None: the
-            beginning of the file.
+        start: Time of hour 0 in an .epw file, in the file's standard time if without a zone; None: its beginning.
         facing_deg: Directions of walls, clockwise from north, [degrees]. The column sun_w_m2 of an .epw file is the
             mean sunlight on these walls (ground of albedo 0.2); empty: no such column.
         any_year: If True, an .epw file is a typical year that repeats; if False, it must cover `start`.

@@ -64,8 +64,7 @@ def build_mesh(
         snapshot: The trained field on its corner lattice.
         selection: The rules that choose the solid voxels.
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
-            column vectors of the trained scene to metres. After a reflection, nodes are reordered so that volumes stay
-            positive.
+            column vectors of the trained scene to metres. A reflection reorders nodes to keep volumes positive.
         boundary: Whether the boundary follows the level set of the density, or voxel faces.
         up: Up direction in the coordinates of the mesh.
         rules: The user's rules for patches and regions.

@@ -1,4 +1,4 @@
-"""Temperatures at mesh nodes: interpolated where they were measured, extended harmonically elsewhere."""
+"""Temperatures of mesh nodes: interpolated at measured nodes, extended harmonically to all others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from light that leaked through a surface, or from the tail of an interpolation."
 _RELATIVE_RESIDUAL = 1e-9
 _MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
-"""Least conductance of an edge relative to the mean, so that no value overshoots and components stay connected."""
+"""Least conductance of an edge as a share of the mean; it prevents overshoots and keeps components connected."""
 
 
 def interpolate_corners(
@@ -37,7 +37,7 @@ def interpolate_corners(
         weights: Weight of each corner's value, at least 0, 0 for an unknown value, shape (nx, ny, nz).
 
     Returns:
-        values: Values at the points, shape (n,) or (n, k); 0 where all eight corners have weight 0.
+        values: Values at the points, shape (n,) or (n, k); 0 if all eight corners have weight 0.
         weight: sum_c t_c w_c, shape (n,).
     """
     # Not by ndimage.map_coordinates, which copies the lattice in double precision.

@@ -115,7 +115,7 @@ class PatchRules:
 def load_patch_rules(path: Path | str) -> PatchRules:
     """Read a user's rules for patches and regions from a yaml file.
 
-    Raises `MeshError` if the file does not exist or is no yaml, or if an entry, named in the message, is not valid.
+    Raises `MeshError` if the file does not exist or is no yaml, or if an entry is not valid (the message names it).
     """
     path = Path(path)
     rules = as_record(path.name, read_yaml(path), PatchRules)
@@ -249,8 +249,8 @@ def _applied(
     centroids: FloatArray,
     colours: npt.NDArray | None,
 ) -> Applied:
-    """Return `start`, the default numbers (n,), overwritten by rules; `names` are the names of the default numbers.
-    Box, plane and colour are checked here. Rule k applies to elements at which the mask `allowed[k]`, (n,), is True."""
+    """Return the patches or regions by rules; an element that meets none keeps its default `start` (n,), an index into
+    `names`. Rule k needs True in the mask `allowed[k]` (n,); box, plane and colour are checked here."""
     owner = np.full(len(start), -1, dtype=np.int64)
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()

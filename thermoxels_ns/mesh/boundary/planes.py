@@ -103,7 +103,7 @@ class _Surface(NamedTuple):
 
 
 def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Building:
-    """Return the flat elements of a building: faces of the closed body between planes through a mesh's boundary.
+    """Return the closed body between planes through a mesh's boundary; its faces are the building's flat elements.
 
     The planes cut space into convex cells. The body is the largest connected group of cells of which the mesh fills
     more than half. An element is a face between a cell of the body and another cell, so elements close exactly at the
@@ -184,7 +184,7 @@ def _planes(surface: _Surface) -> list[_Plane]:
 def _fitted(
     surface: _Surface, left: IntArray, best: FloatArray, found: Sequence[_Plane]
 ) -> tuple[_Plane | None, IntArray]:
-    """Return the plane that holds most area of those of the triangles `left` that face `best`, and its triangles.
+    """Return the plane with most area of triangles that face `best`, out of the triangles `left`, and its triangles.
 
     `best` is a unit vector, `left` holds indices. The plane is None if it is too small or its direction is uncertain:
     it is narrow, or its triangles are scattered (as on two distant ledges) and no plane in `found` is parallel.

@@ -61,7 +61,7 @@ def group_faces(tets: IntArray) -> Groups:
 
 
 def group_sides(facets: IntArray) -> Groups:
-    """Return groups of triangle sides with the same ends; row 3 f + s is the side of triangle f from its node s on."""
+    """Return groups of triangle sides with equal ends; row 3 f + s is side s of triangle f, from node s to the next."""
     ends = np.roll(facets, -1, axis=1)
     return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
 

@@ -30,7 +30,7 @@ _STEP = 0.5  # Distance between the points of a ray at which voxels are looked u
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """Counts for each voxel of the cameras whose image holds the voxel, and of those with a free line to it."""
+    """Counts for each voxel of cameras whose image holds the voxel, and of these cameras with a free line to it."""
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""
@@ -107,9 +107,9 @@ def _count_along(
 def _follow(solid, held, eye, u, v, low, step, owns, ahead, away, in_image, free):
     """Follow rays through the layers `ahead` at the distances `away` (l,) from the camera, and count voxels in place.
 
-    One is added to `in_image` at each voxel whose ray is in the image, `held` (a, b), and to `free` if also no solid
-    voxel blocks the ray. Rays have the slopes `u` (a,) and `v` (b,); `low` and `step` (2,) are the lower ends and steps
-    of the slopes. `owns` (2,) says for both axes whether rays of slope exactly 1 or -1 belong to this pyramid.
+    One is added to `in_image` at each voxel whose ray is in the image, `held` (a, b), and to `free` if also no `solid`
+    voxel blocks the ray. Rays start at `eye` with the slopes `u` (a,) and `v` (b,), which begin at `low` and differ by
+    `step` (2,). `owns` (2,) says for both axes whether rays of slope exactly 1 or -1 belong to this pyramid.
     """
     clear, (_, num_u, num_v) = held.copy(), solid.shape
     ray_of_u, ray_of_v = np.empty(num_u, np.int64), np.empty(num_v, np.int64)

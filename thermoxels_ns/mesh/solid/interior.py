@@ -150,7 +150,7 @@ def _without_strays(body: BoolArray) -> BoolArray:
 
 
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
-    """Return the generalised winding number at each voxel of the surface of all faces between `solid` and `air` voxels.
+    """Return at each voxel the generalised winding number of the surface of all faces between `solid` and `air`.
 
     The number is 1 inside a closed surface and 0 outside; it changes gradually through a hole in the surface. Faces of
     a voxel that is neither solid nor air do not belong to the surface. For triangles see Jacobson, Kavan and

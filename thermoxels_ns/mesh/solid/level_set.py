@@ -88,8 +88,8 @@ def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolAr
 
 
 def _thin(cells: BoolArray) -> BoolArray:
-    """Return a mask of voxels of walls one voxel thick. Such a voxel has no solid neighbour along one axis; at least
-    two of its other neighbours are such voxels as well."""
+    """Return a mask of voxels of walls one voxel thick: they have no solid neighbour along one axis, and at least two
+    of their neighbours along the other axes have none along this axis either."""
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & (_beside(cells, axis) == 0)

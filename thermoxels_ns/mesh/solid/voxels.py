@@ -52,7 +52,7 @@ MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` inte
 
 @record(MeshError)
 class SolidSelection:
-    """The rules that tell solid voxels from empty ones; the fields are the export's options of the same names."""
+    """The rules that separate solid from empty voxels; the fields are the export's options of the same names."""
 
     density_percentile: Annotated[float, Field(ge=0, le=100)] | None = None
     """Percentile of the density of all voxels, as in the Thermoxels paper."""
@@ -63,7 +63,7 @@ class SolidSelection:
     region: Literal["auto", "all"] = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
     region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
-    interior: Literal["solid", "hollow"] = "solid"  # The voxels of `interior` are filled, or stay empty
+    interior: Literal["solid", "hollow"] = "solid"  # solid: the voxels of `interior` are filled; hollow: they are not
     wall_thickness: Annotated[float, Field(gt=0)] | None = None
     """Thickness that walls get instead of a filled interior, [m]."""
 

@@ -277,8 +277,7 @@ def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
 
 
 def _oriented(tet: tuple[int, ...]) -> _Tet:
-    """Return a tetrahedron of bundle points and cuts, its last two nodes exchanged if its volume is negative. The
-    volume is computed with each cut at the middle of its edge, as cuts elsewhere do not change the sign."""
+    """Return a tetrahedron with its last two nodes exchanged if its volume, with cuts in the middle, is negative."""
     middles = [0.5 * (BUNDLE_POINTS[a] + BUNDLE_POINTS[b]) for a, b in BUNDLE_EDGES]
     corners = np.concatenate([BUNDLE_POINTS, middles])[list(tet)]
     a, b, c, d = tet

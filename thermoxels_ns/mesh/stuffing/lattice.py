@@ -147,7 +147,7 @@ each cut and moved point at each end of its range. Labelle and Shewchuk (2007) g
 
 
 def _contractible_links() -> BoolArray:
-    """Return whether each set of a point's 14 neighbours can be shrunk to a point, (2^14,); bits number the sets."""
+    """Return whether each set of a point's neighbours can be shrunk to a point, (2^14,); bit d is neighbour d."""
     # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if both the
     # part and the rest of the sphere are one piece, and neither is empty.
     steps = DIRECTIONS[:, None, :] - DIRECTIONS[None, :, :]

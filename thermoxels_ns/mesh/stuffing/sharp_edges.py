@@ -114,8 +114,8 @@ class Surface:
     areas: FloatArray  # areas of the triangles, shape (f,)
     normals: FloatArray  # unit normals of the triangles, shape (f, 3)
     node_normals: FloatArray
-    """Mean unit normal of the triangles around each node, weighted by area, shape (n, 3). The mean is shorter than 1
-    where normals differ, and 0 at nodes without a triangle."""
+    """Mean, weighted by area, of the unit normals of the triangles around each node, shape (n, 3). It is shorter than 1
+    if the normals differ, and 0 without triangles."""
     on_border: BoolArray  # True for nodes on the border of the lattice, shape (n,)
 
     @classmethod
