@@ -21,7 +21,7 @@ from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, size_of_double_tiff
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
-"""What a camera file holds. "both": photograph and temperatures; "thermal picture": colours only, named thermal."""
+"""What a camera file holds. "both": photograph and temperatures; "thermal picture": colours alone, named thermal."""
 
 _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatures", "celsius", "ir", "tir", "lwir"})
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
@@ -59,7 +59,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def natural_key(path: Path) -> list[tuple[int, str, int]]:
-    """Return a sort key for a path that orders numbers in names by value: 2 before 10.
+    """Return a path's key for sorting, in which numbers within names are ordered by value: 2 before 10.
 
     >>> sorted([Path("b10"), Path("b2")], key=natural_key)[0].name
     'b2'
@@ -71,10 +71,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Identify every picture and table in a folder and its subfolders, except in the folders `without`.
+    """Return the role of every picture and table in a folder and its subfolders, except the folders `without`.
 
-    Hidden files and folders, linked folders and pipes are skipped; `say` reports folders that cannot be opened.
-    Raises `SceneError` if `folder` is no folder.
+    Hidden files and folders, linked folders and pipes are skipped. `say` receives progress, and folders that cannot be
+    opened. Raises `SceneError` if `folder` is no folder.
     """
     if not folder.is_dir():
         remedy = "Pass the folder that the memory card was copied to."
@@ -116,7 +116,10 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
-    """Return a file's role by content, for pictures by names below `folder`; raise `ThermoxelsError` if damaged."""
+    """Return a file and its role, by content, or for plain pictures by the names of file and folders below `folder`.
+
+    Raises `ThermoxelsError` if the file is damaged.
+    """
     with errors_name(path, "a camera file that can be decoded"):
         check_not_empty(path)
         suffix = path.suffix.lower()
@@ -143,7 +146,10 @@ def identify(path: Path, folder: Path) -> CameraFile:
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:
-    """Return whether a name ends in the word "t", or the name or else the nearest telling folder says thermal."""
+    """Return whether a picture's name marks it as thermal: by a last word "t", or by a word such as "thermal".
+
+    Without such a word, or one such as "visible", in the file's name, the nearest folder with one decides.
+    """
     words = words_of(path.stem)
     if len(words) > 1 and words[-1] == "t":
         return True

@@ -32,7 +32,7 @@ class CaptureFrame:
     thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN where no temperature is known
     thermal_source: str  # path of the camera's file with the thermal image, relative to the capture folder
     metadata: ThermogramMetadata  # what the thermal file states besides its temperatures
-    camera: str | None = None  # maker and model of the thermal camera, or else of the photograph's
+    camera: str | None = None  # maker and model of the thermal camera, or if unknown, of the photograph's camera
     focal_px: float | None = None  # focal length that the photograph states, [pixels]
     orientation: int = 1  # EXIF's orientation of the photograph, 1 to 8
     gps: GpsFix | None = None
@@ -61,12 +61,10 @@ def read_frames(
 ) -> CaptureFrames:
     """Write each pair's temperatures, and photographs taken out of thermal files, to `folder`; return the frames.
 
-    Pixels of the thermal sensor that are stuck at one value become NaN. With `settings.skip_bad` a pair with an
-    unreadable file goes to `dropped`, as photographs and thermal images of an unusual size always do.
-
-    Raises:
-        ThermoxelsError: A file cannot be read and `settings.skip_bad` is off, or no pair is left.
-        OSError: A result cannot be written.
+    `pairs` have names relative to `root`. Pixels of the thermal sensor that are stuck at one value become NaN. Pairs
+    with a photograph or thermal image of an unusual size are listed in `dropped`; so are pairs with an unreadable file
+    if `settings.skip_bad` is on. Raises `ThermoxelsError` if a file cannot be read and `settings.skip_bad` is off, or
+    if no pair is left. Raises `OSError` if a result cannot be written.
     """
     for name in ("thermal", "photographs"):
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -159,7 +157,7 @@ def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[Capture
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
-    """Return lines (name, text) for the report on formats of thermal files and settings of their temperatures."""
+    """Return rows (name, text) for the report: formats of the thermal files, conditions of their temperatures."""
     known = [frame.metadata for frame in frames]
     formats = Counter(
         one.format + ("" if one.celsius_per_count is None else f" with {one.celsius_per_count:.4g} K per count")

@@ -23,7 +23,8 @@ _DJI_PHOTOGRAPHS = ("v", "w")
 _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
 _CLEARLY_NEARER = 2.0
 _CLOCK_STEP_S = 0.5
-"""A nearest file t seconds away is ambiguous if another is within _CLEARLY_NEARER * t + _CLOCK_STEP_S and the limit."""
+"""The nearest file, t seconds away, is ambiguous if the next is within both _CLEARLY_NEARER * t + _CLOCK_STEP_S and the
+time limit."""
 _REMEDY = (
     "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
@@ -36,12 +37,12 @@ class Pair:
     """One photograph and its thermal image, named by their paths relative to the capture folder, with "/"."""
 
     photograph: str
-    thermal: str  # the same as `photograph` where the camera writes both into one file
+    thermal: str  # the same as `photograph` if the camera writes both into one file
     how: str  # the rule by which the two files were paired
 
     @property
     def in_one_file(self) -> bool:
-        """True when photograph and thermal image lie in the same file."""
+        """True if photograph and thermal image are in the same file."""
         return self.photograph == self.thermal
 
 
@@ -56,10 +57,9 @@ class PairSearch:
 def search_pairs(
     folder: Path, settings: CaptureSettings, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> PairSearch:
-    """Scan a folder, except the folders `without`, and return its pairs; files that cannot be read are in `unpaired`.
+    """Return the pairs in a folder, except its folders `without`. Files that cannot be read are in `unpaired`.
 
-    Raises:
-        SceneError: The folder holds no pair, or a file cannot be read and `settings.skip_bad` is off.
+    Raises `SceneError` if there is no pair, or if a file cannot be read and `settings.skip_bad` is off.
     """
     found = scan_folder(folder, without, say)
     search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
@@ -84,11 +84,11 @@ def search_pairs(
 
 
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
-    """Pair photographs and thermal images by four rules in turn: in one file, DJI's names, equal names, time.
+    """Return pairs of photographs and thermal images, found by four rules in turn: one file, DJI's names, names, time.
 
     Names are compared without words for the kind of image: ``10-58-15-636-visible.jpg`` pairs with
     ``10-58-15-636-radiometric.tiff``. Two files pair by time if each is the other's nearest, at most `time_limit_s`
-    away, and no second file is about as near. The thermal camera's clock is ahead by `clock_offset_s`.
+    away, and no second file is about as near. `clock_offset_s` says how far the thermal camera's clock is ahead.
     """
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
     unpaired = dict[Path, str]()
@@ -122,7 +122,7 @@ _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
 
 
 def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
-    """Pair DJI_0001_T with DJI_0001_V (or _W); times in the two names may differ by up to `_DJI_LATE_S`."""
+    """Return pairs such as DJI_0001_T and DJI_0001_V (or _W); times in the names may differ by up to `_DJI_LATE_S`."""
     taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
     for file in (*photographs, *thermal):
         match = _DJI.match(file.path.stem.lower())
@@ -160,7 +160,7 @@ def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
-    """Pair files of equal names; where several files share a name, their folders must also be equal (`place`)."""
+    """Return pairs of files with equal names (`_shot`). If several files share a name, their `place` must be equal."""
 
     def place(file: CameraFile) -> tuple[str, ...]:
         folders = file.path.relative_to(folder).parts[:-1]
@@ -193,7 +193,7 @@ def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], 
 
 
 def _shot(stem: str) -> tuple[str, ...]:
-    """Return the words of a file name (`words_of`) that identify the shot, without words for the kind of image."""
+    """Return the words (`words_of`) of a file name that identify the shot, without words for the kind of image."""
     words = words_of(stem)
     kept = tuple(word for word in words if word not in ROLE_WORDS)
     if len(kept) > 1 and kept[-1] in _LAST_LETTERS:

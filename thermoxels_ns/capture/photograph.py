@@ -1,4 +1,4 @@
-"""Reads photographs and the headers of photographs: time, place, lens and orientation."""
+"""Reads photographs, and from their headers time, place, lens and orientation."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ class GpsFix:
 
 @dataclass(frozen=True)
 class PhotographFacts:
-    """Contents of a photograph's header; a field is None where the header does not state it."""
+    """Contents of a photograph's header. A field is None if the header does not state it."""
 
     width: int
     height: int
     camera: str | None  # maker and model
-    taken_at: datetime | None  # as the camera's clock showed it, with fractions of a second where the file has them
+    taken_at: datetime | None  # time that the camera's clock showed, with fractions of a second if the file has them
     focal_px: float | None
-    """Focal length, [pixels], from the lens and the sensor's pixel pitch, else from the equivalent on 35 mm film."""
+    """Focal length, [pixels], from the lens's length and the sensor's pixel pitch, else from the 35 mm equivalent."""
     orientation: int
-    """EXIF orientation, 1 to 8: how to turn the stored pixels so that the picture stands upright; 1 if not stated."""
+    """EXIF orientation, 1 to 8: how to turn the stored pixels to make the picture upright; 1 if not stated."""
     gps: GpsFix | None
     gimbal_deg: tuple[float, float] | None
     """Pitch (0 is level, -90 looks straight down) and roll of the camera against gravity, [degrees]."""
 
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
-    """Read a photograph's header; raise `SceneError` if the file is no picture or claims an absurd size."""
+    """Return the contents of a photograph's header; raise `SceneError` if it is no picture or states an absurd size."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         width, height = image.size
         camera, taken_at = read_exif_facts(image)
@@ -88,7 +88,7 @@ def _number(value: object) -> float | None:
 
 
 def _with_fraction(taken_at: datetime | None, tags: Mapping[int, Any]) -> datetime | None:
-    """Add the fraction of a second from `tags`, stored as digits after the decimal point or as a fraction."""
+    """Return `taken_at` plus the fraction of a second in EXIF `tags`, stored as decimal digits or as a fraction."""
     if taken_at is None:
         return None
     for tag in _SUBSECOND:

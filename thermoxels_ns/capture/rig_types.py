@@ -1,8 +1,8 @@
-"""Types shared by poses, rig, drift and the scene writer, and the ten parameters of a rig."""
+"""Types that poses, rig, drift and the scene writer share, and the ten parameters of a rig."""
 
 # Poses are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Transforms between two cameras
 # and points in front of a camera have x right, y down, z ahead (OpenCV). Pixel centres lie at +0.5. Lengths are in
-# world units, the unit of the model from structure from motion; how many metres a world unit has may be unknown.
+# world units, the unit of the model from structure from motion; its length in metres may be unknown.
 
 from __future__ import annotations
 
@@ -18,26 +18,24 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
 OPENGL_FROM_OPENCV: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Matrix from OpenCV to OpenGL camera axes and back. For a pose in OpenGL axes, ``pose @ OPENGL_FROM_OPENCV`` is that
-pose in OpenCV axes."""
+"""Matrix from OpenCV to OpenGL camera axes and back: a pose in OpenGL axes times this matrix is in OpenCV axes."""
 
 PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1")
 """The ten changes of a rig against its start: rotation vector r [radians], shift t [world units], natural logarithm of
-the focal length's growth, shift of the principal point [thermal pixels at full size], and OpenCV's k1."""
-_TURN_SIGMA_DEG, _K1_SIGMA = 3.0, 0.05  # standard deviations of the turn about each axis, and of k1, of a guess
+the focal length's ratio, shift of the principal point [thermal pixels at full size], and change of OpenCV's k1."""
+_TURN_SIGMA_DEG, _K1_SIGMA = 3.0, 0.05  # a guess's standard deviations of the turn about each axis and of k1
 _CENTRE_SIGMA = 0.005
-"""Standard deviation of a guessed principal point, as a share of the image width. With a narrow lens its shift looks
-almost like a turn, so a larger value also leaves the rotation more uncertain."""
+"""Standard deviation of a guessed principal point, as a share of the image width. With a narrow lens, its shift looks
+almost like a turn. A larger value therefore also makes the rotation more uncertain."""
 _SMALLEST_DEPTH_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class RigFrame:
-    """One photograph with its thermal image and the scene points that it shows."""
+    """One photograph, its thermal image, and the scene points that the photograph shows."""
 
     photograph: npt.NDArray | Path
-    """Grey or RGB array of any number type, or the photograph's file. The size is that of the visible camera, or
-    smaller in the same proportions."""
+    """Grey or RGB array of any number type, or the photograph's file; of the visible camera's size or proportions."""
     temperature_c: npt.NDArray | Path
     """Temperatures [degrees C], shape (height, width), NaN where unknown; or the path of a .npy file of them."""
     points: FloatArray
@@ -47,16 +45,15 @@ class RigFrame:
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """A rig that was found or given, or the guess that a search starts from."""
+    """A rig that was found or given, or a guess from which the search starts."""
 
     thermal_camera: Camera
     visible_to_thermal: FloatArray
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
-    determined: bool
-    """True when the rig was found or given. False: camera and transform are a guess."""
-    explanation: str  # text for the report: what was found, where a guess comes from, why the rig is not determined
+    determined: bool  # True if the rig was found or given. False: camera and transform are a guess
+    explanation: str  # text for the report: what was found, the source of a guess, why the rig is not determined
     covariance: FloatArray = field(default_factory=lambda: np.full((10, 10), np.nan))
-    """Covariance of the changes `PARAMETERS`, shape (10, 10), NaN where unknown; of a guess: how far it may be off."""
+    """Covariance of the changes `PARAMETERS`, (10, 10), NaN if unknown; for a guess, how wrong it may be."""
     projection_sigma_px: float = math.nan
     """Typical standard error of a scene point's place in the thermal image, both axes together [thermal pixels]."""
 
@@ -88,10 +85,11 @@ def guessed_rig(
     focal_sigma: float = 0.08,
     shift_sigma: float = math.nan,
 ) -> RigEstimate:
-    """Return a guess with the usual standard deviations; without a transform, that of two cameras in one place.
+    """Return a guessed rig with the usual standard deviations.
 
-    `source` says where the guess comes from; `focal_sigma` is the standard deviation of the focal length, as a share of
-    it; `shift_sigma` that of the lens's place along each axis [world units], NaN if unknown.
+    `source` is a text with the guess's source. `visible_to_thermal` (4, 4) None: both cameras have the same pose.
+    `focal_sigma` is the focal length's standard deviation as a share of it; `shift_sigma` is the standard deviation of
+    the lens's position along each axis [world units], NaN if unknown.
     """
     centre, turn = _CENTRE_SIGMA * camera.width, np.radians(_TURN_SIGMA_DEG)
     sigmas = np.array([turn] * 3 + [shift_sigma] * 3 + [focal_sigma, centre, centre, _K1_SIGMA], dtype=np.float64)
@@ -101,13 +99,13 @@ def guessed_rig(
 
 @dataclass(frozen=True, eq=False)
 class RigModel:
-    """Start of a rig for one size of the thermal image. Its methods apply ten small changes (`PARAMETERS`):
+    """A rig from which a search starts, at one size of the thermal image. Methods apply the ten changes `PARAMETERS`:
     x_thermal = R(rx, ry, rz) R_start x_visible + t_start + t, then the pinhole camera with radial distortion."""
 
     camera: Camera  # thermal camera of the start, resized to this size of the thermal image
     transform: FloatArray  # visible to thermal camera, shape (4, 4), OpenCV axes
     pixel_share: float = 1.0
-    """Pixels at this size per pixel of the full thermal image; cx and cy change in pixels of the full image."""
+    """Pixels at this size per pixel of the full thermal image. The changes cx and cy are pixels of the full image."""
 
     def at_size(self, width: int, height: int) -> RigModel:
         """Return the same start for a thermal image of another size."""
@@ -131,15 +129,15 @@ class RigModel:
         return camera, transform
 
     def project(self, change: FloatArray, points: FloatArray) -> FloatArray:
-        """Return the thermal pixels (n, 2) of points (n, 3) in the visible camera's axes; NaN behind the camera."""
+        """Return thermal pixels (n, 2) of points (n, 3) in the visible camera's OpenCV axes; NaN behind the camera."""
         camera, transform = self.changed(change)
         return camera.project(points @ transform[:3, :3].T + transform[:3, 3])
 
     def pull_back(self, change: FloatArray, points: FloatArray, slope: FloatArray) -> FloatArray:
-        """Return the derivative of a sum over points with respect to the ten changes, shape (10,), by the chain rule.
+        """Return the derivative (10,) of a function of projected points by the ten changes, by the chain rule.
 
-        `slope` (n, 2) is the derivative of the sum with respect to the pixels that `project` gives for `points` (n, 3).
-        Points behind the thermal camera do not count.
+        `slope` (n, 2) is the function's derivative by the pixels to which `project` brings `points` (n, 3) at `change`
+        (10,). Points that are not clearly in front of the thermal camera are left out.
         """
         camera, transform = self.changed(change)
         ahead = points @ transform[2, :3] + transform[2, 3] > _SMALLEST_DEPTH_SHARE * np.median(points[:, 2])
@@ -156,16 +154,15 @@ class RigModel:
 
 @dataclass(frozen=True, eq=False)
 class DriftEstimate:
-    """How far each thermal image reads too high (offsets), and how that error grows towards the corners (radial)."""
+    """Errors of the readings of thermal images: an offset for each image, and a radial term for all (vignetting)."""
 
     offsets_k: FloatArray
-    """Offset to subtract from each frame's temperatures, in the frames' order, mean 0, shape (frames,) [K]."""
+    """Error of each frame's temperatures, to subtract, in the frames' order, mean 0, shape (frames,) [K]."""
     radial: tuple[float, ...]
-    """Coefficients c of sum(c[i] * r ** (2 * i + 2)) [K], r = 1 in the image's corner; subtracted from all frames."""
-    before_k: float  # median difference of two readings of one held-out scene point, uncorrected [K]
+    """Coefficients c of the error sum(c[i] * r ** (2 * i + 2)) [K] of all frames, r = 1 in the image's corner."""
+    before_k: float  # median absolute difference of two readings of a held-out scene point, uncorrected [K]
     after_k: float  # the same median after a correction fitted to the other points [K]
-    used: bool
-    """True when the correction lowers that median. False: all offsets are 0 and `radial` is empty."""
+    used: bool  # True if the correction lowers this median. False: all offsets are 0 and `radial` is empty
     explanation: str  # text for the report
 
     def radial_k(self, width: int, height: int) -> FloatArray:

@@ -44,7 +44,7 @@ class Scene:
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
-    """Write a scene into `output` in place of an earlier one; transforms.json comes last and marks it as complete."""
+    """Write a scene into `output`, in place of an earlier one. The last file, transforms.json, marks it as complete."""
     new = output / CACHE_FOLDER / "new_scene"
     shutil.rmtree(new, ignore_errors=True)
     for name in _FOLDERS:

@@ -8,8 +8,7 @@ from typing import Literal
 
 from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
 
-StageName = Literal["poses", "rig"]
-"""The stages of a capture whose results are kept, in order."""
+StageName = Literal["poses", "rig"]  # the stages of a capture whose results are kept, in order
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 

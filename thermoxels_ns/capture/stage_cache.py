@@ -33,10 +33,10 @@ def run_stage(
 ) -> str:
     """Run a stage in a folder of its own, unless its earlier result is still valid; return the key of the result.
 
-    The key is a hash of the folder's name and of `depends_on`, which names everything that the result depends on, as
-    values for json. A finished stage whose key is the same as last time is not run, unless `again` asks for it. `work`
-    writes the result into `folder`, which still holds the files of an interrupted run with the same key. Raises
-    `OutputError` if the result cannot be written.
+    The key is a hash of the folder's name and of `depends_on`. The caller must put everything that the result depends
+    on into `depends_on`, as values for json. A finished stage with an unchanged key is not run, unless `again` is True.
+    `work` gets `folder` and writes the result there; files of an interrupted run with the same key are still in it.
+    Raises `OutputError` if the result cannot be written.
     """
     content = json.dumps([__version__, _FORMAT, folder.name, depends_on], sort_keys=True, default=str)
     key = hashlib.sha256(content.encode()).hexdigest()
@@ -60,13 +60,13 @@ def run_stage(
 
 
 def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:
-    """Return name (relative to `root`), size [bytes] and time of change [ns] of each file."""
+    """Return the name (relative to `root`), size [bytes] and time of the last change [ns] of each file."""
     found = ((path.relative_to(root).as_posix(), path.stat()) for path in paths)
     return [(name, status.st_size, status.st_mtime_ns) for name, status in found]
 
 
 def prepare_output(folder: Path) -> Path:
-    """Make the output folder and return its path; raise `OutputError` if it holds files but no earlier capture."""
+    """Make the output folder and return its path; raise `OutputError` if it has files but no earlier capture."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
         remedy, got = "Pass another folder with --output.", f"{folder}, which holds other files"
@@ -81,7 +81,7 @@ def save_rig(path: Path, rig: RigEstimate) -> None:
 
 
 def load_rig(path: Path) -> RigEstimate:
-    """Read a rig that `save_rig` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
+    """Return a rig that `save_rig` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
     with errors_name(path, "what an earlier capture wrote", "Run it with --from-stage rig.", ThermoxelsError):
         with np.load(path, allow_pickle=False) as opened:
             values = {name: opened[name].tolist() if opened[name].ndim < 2 else opened[name] for name in opened.files}

@@ -30,7 +30,7 @@ PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """Everything that one finished capture found; `run_capture` also wrote the scene to the folder `output`."""
+    """Everything that one finished capture found. The scene is in the folder `output`."""
 
     source: Path
     output: Path
@@ -39,7 +39,7 @@ class CaptureResult:
     read: CaptureFrames
     scene: Scene
     start: RigEstimate  # the rig that the search started from
-    scale_missing: str  # reason why no metric scale was found; empty where a scale was found
+    scale_missing: str  # reason why no metric scale was found; empty if one was found
 
     @property
     def page(self) -> Path:
@@ -54,13 +54,12 @@ def run_capture(
     write_page: Callable[[CaptureResult], None],
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureResult:
-    """Turn a folder of camera files into a scene, a page and what took minutes to find, in `output`.
+    """Turn the folder `source` of camera files into a scene in the folder `output`.
 
-    `write_page` writes the report at the end. `say` is called with one line of progress at a time.
-
-    Raises:
-        ThermoxelsError: A file cannot be read, no pairs or no poses are found, or an option is out of range.
-        OutputError: `output` cannot be written to, its disk is full, or another capture is working in it.
+    Poses and rig, which take minutes to find, are kept there for the next run. `write_page` writes the report at the
+    end. `say` receives one line of progress at a time. Raises `ThermoxelsError` if a file cannot be read, no pairs or
+    no poses are found, or an option is out of range. Raises `OutputError` if `output` cannot be written to, its disk is
+    full, or another capture is working in it.
     """
     if not source.is_dir():
         scan_folder(source)  # says what is wrong
@@ -138,7 +137,7 @@ def _captured(
 def _keep_poses(
     read: CaptureFrames, source: Path, folder: Path, settings: CaptureSettings, say: Callable[[str], None]
 ) -> str:
-    """Find poses and scene points from the photographs, or keep those in `folder`; return the key of the result."""
+    """Find poses and scene points and write them to `folder`, unless a valid result is there; return its key."""
     names = ("image_size", "max_features", "lens", "seed", "threads")
     depends = {
         "options": {name: getattr(settings, name) for name in names},

@@ -1,4 +1,4 @@
-"""The COLMAP model in a scene's folder: where it lies, and reading it."""
+"""Finds the COLMAP model in a scene's folder, reads it, and matches its images with files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import FloatArray
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
-"""Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
+"""Folders, relative to a scene's folder, in which a COLMAP model may lie; the first that holds a model is used."""
 PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -22,7 +22,7 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""Order of the parameters of COLMAP's lens models, by their keys in transforms.json; f is both focal lengths."""
+"""Parameters of each of COLMAP's lens models, in COLMAP's order, by the keys in transforms.json; f is fl_x and fl_y."""
 
 
 def is_model(folder: Path) -> bool:
@@ -31,10 +31,10 @@ def is_model(folder: Path) -> bool:
 
 
 def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
-    """Read the COLMAP model in a folder: cameras, posed images and points, each by its number in the model.
+    """Return the cameras, the posed images and the points of the COLMAP model in a folder, each by its number there.
 
-    These are records of nerfstudio's reader, which notices a file that is cut off; pycolmap reads such a points3D.bin
-    for ever. Raises `SceneError` if a file cannot be read.
+    The values are records of nerfstudio's reader. It notices a file that is cut off, while pycolmap never finishes
+    reading a points3D.bin that is cut off. Raises `SceneError` if a file cannot be read.
     """
     from nerfstudio.data.utils import colmap_parsing_utils  # both slow to import, and only needed here
 
@@ -56,7 +56,7 @@ def camera_to_world(image: Any) -> FloatArray:
 
 
 def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
-    """Return the parameters of a lens by their keys in transforms.json; empty for a model that is not read.
+    """Return the parameters of a lens model by their keys in transforms.json; empty for a model not in `PARAMETERS`.
 
     >>> lens_entries("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
     {'cx': 320.0, 'cy': 240.0, 'fl_x': 500.0, 'fl_y': 500.0}
@@ -68,10 +68,11 @@ def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
 
 
 def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the pairs (image, file) of indices that belong to the same photograph, by names, else without suffixes.
+    """Return the pairs (index of an image, index of a file) that are the same photograph, sorted by the file's index.
 
-    The file's name ends with the image's, folders included. The longest such image is taken; images that then belong to
-    several files, and images of one name, are left out.
+    A file belongs to the image whose name, folders included, is the end of the file's name; of several, to the longest.
+    Names that several images have, and images to which several files belong, are left out. What is then left is matched
+    again by names without suffixes.
 
     >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png", "images/1.jpg"])
     [(1, 0), (0, 2)]

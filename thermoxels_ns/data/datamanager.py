@@ -1,4 +1,4 @@
-"""nerfstudio datamanager with two streams of rays: colour and temperature."""
+"""nerfstudio datamanager whose batches have two streams of rays: colour and temperature."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class ThermalDataManagerConfig(VanillaDataManagerConfig):
 class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     """Source of batches of colour and thermal rays of one scene, made in this process.
 
-    In training (test_mode "val") a training batch depends on seed and step alone. In other modes the number of the call
-    replaces the step: nerfstudio's exporters ask for step 0 every time and need new rays each time.
+    In training (test_mode "val"), a training batch depends on seed and step alone. In other modes, the number of the
+    call replaces the step, because nerfstudio's exporters always pass step 0 and need new rays each time.
     """
 
     config: ThermalDataManagerConfig
@@ -107,9 +107,9 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return RaySampler(self.eval_dataset, self.config.streams, storage, self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Return the training batch of a step: rays, and their targets ``image`` (n, 3) and ``thermal`` (n, 1).
+        """Return the rays and targets of the training batch of a step, see `RaySampler.draw`.
 
-        ``ray_bundle.metadata["stream"]`` says which targets a ray has (bits of `thermoxels_ns.core.feature_rays`).
+        ``metadata["stream"]`` of the rays holds the bits (`core.feature_rays`) of the targets that each ray has.
         """
         number = step if self.test_mode == "val" else self.train_count
         self.train_count += 1
@@ -117,7 +117,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.train_rays.draw(generator, self._rgb_rays(), self.config.thermal_num_rays_per_batch)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Return a batch of rays of the evaluation split, in the form of `next_train`."""
+        """Return rays and targets of the evaluation split, in the form of `next_train`, chosen by seed and step."""
         self.eval_count += 1
         rgb_rays = self.config.eval_num_rays_per_batch
         share = self.config.thermal_num_rays_per_batch / max(self.config.train_num_rays_per_batch, 1)
@@ -131,16 +131,17 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.eval_dataloader.get_camera(index)
 
     def training_rays(self, stream: int, max_rays_per_image: int | None = None) -> Iterator[RayBundle]:
-        """Yield training rays through the pixels of a regular grid, always the same, without decoding photographs.
+        """Yield bundles of training rays through the pixels of a regular grid, without decoding photographs.
 
         `stream` holds bits of `core.feature_rays`. The thermal bit alone gives rays through valid thermal pixels; both
-        bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid has as
-        many pixels of an image as do not exceed `max_rays_per_image`. Raises ValueError for an unknown stream.
+        bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid is the
+        same in each call and has at most `max_rays_per_image` pixels of an image (None: all). Raises `ValueError` for
+        an unknown stream.
         """
         return self.train_rays.grid(stream, max_rays_per_image)
 
     def training_views(self) -> Views:
-        """Return the cameras of the streams that train: the photographs', and thermal cameras where these differ."""
+        """Return the cameras of the streams that train: the photographs', and the thermal cameras if these differ."""
         dataset, streams = self.train_dataset, self.config.streams
         own = dataset.thermal_cameras is not None
         parts = [dataset.views()] if streams != "thermal" or not own else []

@@ -32,15 +32,16 @@ from thermoxels_ns.radiometry.thermal_pixels import VALID_RANGE_C, ThermalUnit, 
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
-"""Distance of the box from the origin, in longest sides of the box, beyond which a shift in single precision is wrong
-by more than a millionth of the box. National coordinates are so far away."""
-_COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
+"""Distance of the box from the origin, in longest sides of the box. Beyond it, the rounding of a shift to single
+precision is more than a millionth of the box. National coordinates are so far away."""
+_COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature, if it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
-_BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
+"""A file holds kelvins if its median is at least the first number, and the median less 273.15 differs by at most the
+second from the median of the other files."""
+_BYTES_PER_PIXEL = 8  # three colours; for masked photographs also the mask and the pixel's number
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
-MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
-FEWEST_PHOTOGRAPHS = 3  # with fewer, poses stay as given
+MOST_PHOTOGRAPHS = 500  # with more, poses are not adjusted: the normal equations would take minutes
+FEWEST_PHOTOGRAPHS = 3  # with fewer, poses are not adjusted
 
 PoseSource = Literal["auto", "given"]
 SplitMode = Literal["auto", "filename", "lists", "interval"]
@@ -91,7 +92,7 @@ class ThermalDataParserConfig(DataParserConfig):
 class _Scene:
     """The content of one scene that training and evaluation share, read once from all frames.
 
-    A point p in input coordinates lies at scale * (p + translation) in nerfstudio's world, without a rotation.
+    A point p in input coordinates has the coordinates scale * (p + translation) in nerfstudio's world.
     """
 
     file: SceneFile
@@ -107,7 +108,7 @@ class _Scene:
     """Poses (4, 4) fitted to held-out photographs, in input coordinates, by the frame's index in `file.frames`."""
 
     def placed(self, poses: Sequence[FloatArray]) -> torch.Tensor:
-        """Return camera-to-world matrices (4, 4) of input coordinates in nerfstudio's world, (n, 3, 4) float32."""
+        """Return camera-to-world matrices, (4, 4) in input coordinates, in nerfstudio's world, (n, 3, 4) float32."""
         moved = np.stack(poses)[:, :3]
         moved[:, :, 3] = self.scale * (moved[:, :, 3] + self.translation)
         return torch.from_numpy(moved.astype(np.float32))
@@ -118,9 +119,9 @@ class ThermalDataParser(DataParser):
 
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
-    and resolution), ``thermal_unit``, ``image_scale`` (1 / pixels that become one, along a side), ``pixel_size`` (width
-    of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the scene box in input
-    coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
+    and resolution), ``thermal_unit``, ``image_scale`` (used over original resolution of photographs), ``pixel_size``
+    (width of a pixel at the typical distance of surfaces, in nerfstudio's world), ``input_box`` (the scene box in input
+    coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None for val and test, and without tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
     coordinates), and ``fitted_poses`` of val and test are camera to world in nerfstudio's world, (n, 3, 4); else None.
     """
@@ -173,9 +174,9 @@ class ThermalDataParser(DataParser):
         )
 
     def pixels_averaged(self, lenses: Sequence[Camera]) -> int:
-        """Return how many pixels of the photographs that train become one, along a side, to fit into `photographs_gb`.
+        """Return k, so that the training photographs fit into `photographs_gb` if k x k pixels are averaged to one.
 
-        More than one is said. With `downscale_factor` it is 1.
+        `lenses` are the photographs' cameras. With the option `downscale_factor`, k is 1. Above 1, k is printed.
         """
         need_gb = _BYTES_PER_PIXEL * sum(lens.width * lens.height for lens in lenses) / 1e9
         if self.config.downscale_factor is not None or need_gb <= self.config.photographs_gb:
@@ -270,9 +271,10 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 
 def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, float] | None) -> None:
-    """Raise `ThermalFileError` for a file whose unit must be another than degrees Celsius.
+    """Raise `ThermalFileError` for the first file whose median `middles_c` shows that it does not hold degrees Celsius.
 
-    Its median is far from the declared bounds, or without bounds about 273.15 degrees above those of the other files.
+    With `bounds_c`, the median of such a file is far outside the bounds. Without bounds, it is about 273.15 degrees
+    above the medians of the other files.
     """
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
     if bounds_c is None and not usual:
@@ -298,13 +300,10 @@ def survey_thermal_files(
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
 ) -> tuple[dict[Path, tuple[int, int]], TemperatureRange]:
-    """Read every thermal file; return its shape (h, w) by path, and the temperature range.
+    """Read all thermal files; return the shape (h, w) of each by its path, and the temperature range of the scene.
 
-    The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the extremes of the files in
-    `training`.
-
-    Raises:
-        ThermalFileError: A file cannot be read or has no valid pixel, or its median tells of another unit.
+    The range is `bounds_c` [degrees Celsius] (None: empty), widened to the extremes of the files in `training`. Raises
+    `ThermalFileError` if a file cannot be read or has no valid pixel, or if its median shows that its unit is another.
     """
     shapes: dict[Path, tuple[int, int]] = {}
     middles: dict[Path, float] = {}
@@ -326,9 +325,9 @@ def survey_thermal_files(
 
 
 def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) -> Camera:
-    """Return the camera of a frame's thermal image, whose shape (h, w) is in `shapes`; without one, the photograph's.
+    """Return the camera of a frame's thermal image, or the photograph's camera if the frame has no thermal image.
 
-    Raises `SceneError` if the shape does not fit the camera.
+    `shapes` holds the shape (h, w) of each thermal image. Raises `SceneError` if the shape does not fit the camera.
     """
     if frame.thermal is None:
         return frame.intrinsics
@@ -366,7 +365,7 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
-    """Return whether two sets of cameras have the same pixels with the same rays through them, up to rounding."""
+    """Return whether two sets of cameras have equal numbers of pixels, and equal rays through them up to rounding."""
     return all(torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height")) and all(
         torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
         for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
@@ -386,15 +385,13 @@ class Split:
 def split_frames(
     names: Sequence[str], meta: Mapping[str, Any], mode: SplitMode, interval: int, left_out: Sequence[str] = ()
 ) -> Split:
-    """Split frames, given by their sorted `names`, into training and evaluation.
+    """Return a split of the frames, given by their sorted `names`, into training and evaluation.
 
-    "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames and
-    test_filenames of `meta`, the json. "interval" evaluates every `interval`-th frame from index interval // 2 on, so
-    that the ends of the sequence train. "auto" takes the first of the three that suits the scene. Lists may name
-    frames in `left_out`, which are skipped.
-
-    Raises:
-        SceneError: A side is empty, a frame is on both sides, a name is untagged or unknown, or `interval` is below 2.
+    The `mode` "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames
+    and test_filenames in the json's content `meta`. "interval" evaluates every `interval`-th frame from index
+    interval // 2 on, so that the ends of the sequence train. "auto" takes the first of these three that suits the
+    scene. Names in lists that are in `left_out` are ignored. Raises `SceneError` if a side is empty, a frame is on both
+    sides, a name has no tag or is unknown, or `interval` is below 2.
     """
     tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
     if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
@@ -429,8 +426,11 @@ def split_frames(
 
 
 def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
-    """Split by the lists in the json. Without a list of one side, training or evaluation, the side gets all other
-    frames. If only one of val and test is listed, both hold its frames."""
+    """Return the split by the lists in the json's content `meta`, see `split_frames`.
+
+    If training or evaluation has no list, it gets all frames that the other lists do not name. If only one of val and
+    test has a list, both get its frames.
+    """
     position = {Path(name).as_posix(): i for i, name in enumerate(names)}
     found: dict[str, list[int]] = {}
     for side, key in _KEYS.items():
@@ -456,14 +456,14 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
 def refine_poses(
     scene: SceneFile, training: Sequence[int], say: Callable[[str], None]
 ) -> tuple[SceneFile, dict[int, FloatArray]]:
-    """Adjust the poses of training photographs by bundle adjustment, if features held back from it then fit better.
+    """Return the scene with poses of training photographs from bundle adjustment, if features held back fit better.
 
-    `training` holds indices of frames; all other frames are held out and keep their poses, so that evaluation stays
-    independent. A thermal camera with a pose of its own moves with its photograph. `say` receives the result in words.
+    `training` holds indices of frames. All other frames are held out and keep their poses, so that evaluation remains
+    independent. A thermal camera with a pose of its own moves with its photograph. `say` receives a line of text.
 
     Returns:
-        The scene with adjusted poses (`scene` itself if nothing was adjusted), and the poses (4, 4) that fit the
-        features of held-out photographs, by index of the frame.
+        The scene with adjusted poses (`scene` itself if the poses were kept), and the poses (4, 4) that fit the
+        features of held-out photographs best, by index of the frame.
     """
     began = time.perf_counter()
     frames = scene.frames
@@ -505,7 +505,7 @@ def refine_poses(
 
 
 def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], BoolArray | None, Camera]:
-    """Return a photograph in grey, at most `LONGEST_SIDE` pixels long, its mask (None: none), and its camera there."""
+    """Return a photograph in grey, at most `LONGEST_SIDE` pixels long, its mask (None: none), and its scaled camera."""
     grey, mask = frame.read_picture("L", LONGEST_SIDE)
     factor = LONGEST_SIDE / max(grey.size)
     if factor < 1.0:

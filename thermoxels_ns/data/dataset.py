@@ -1,4 +1,4 @@
-"""nerfstudio dataset of paired photographs: colour images as in nerfstudio, and thermal images."""
+"""nerfstudio dataset of pairs: photographs as in nerfstudio's own datasets, and thermal images."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 class ThermalDataset(InputDataset):
     """Photographs of one split with their thermal images; `temperature_range` is None for photographs alone.
 
-    An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` if the scene has masks, ``thermal`` (ht, wt, 1) float32,
-    normalised by the scene's range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool; if thermal cameras
-    differ from the photographs', ``thermal_camera``, nerfstudio `Cameras` of shape (1,); if poses were fitted to
-    held-out photographs, ``fitted_camera`` and, beside a thermal camera, ``fitted_thermal_camera``.
+    An item always holds ``image_idx``, ``image`` (h, w, 3), ``thermal`` (ht, wt, 1) float32, normalised by the scene's
+    range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool. It holds ``mask`` if the scene has masks, and
+    ``thermal_camera`` if thermal cameras differ from the photographs'. If poses were fitted to held-out photographs, it
+    holds ``fitted_camera`` and, beside a thermal camera, ``fitted_thermal_camera``. Cameras are `Cameras`, shape (1,).
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
@@ -41,7 +41,7 @@ class ThermalDataset(InputDataset):
             remedy = "Write: ns-train thermoxels thermal-data --data SCENE."
             raise SceneError("dataparser", expected=expected, got="one that gives photographs only", remedy=remedy)
         self.temperature_range: TemperatureRange | None = self.metadata["temperature_range"]
-        # None: photographs and thermal images share cameras, so that one ray carries a colour and a temperature.
+        # None: photographs and thermal images share cameras, and one ray carries both a colour and a temperature.
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
             # `scale_factor` changes the resolution of the photographs, not of the thermal images.
@@ -50,7 +50,7 @@ class ThermalDataset(InputDataset):
         self._masked = dict[int, tuple[int, int]]()  # Masked and all pixels of a thermal image
 
     def camera(self, image_idx: int, thermal: bool = False) -> Camera:
-        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`."""
+        """Return a photograph's camera; with `thermal`, its thermal image's (`thermal_cameras` must not be None)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         width, height = (int(getattr(cameras, name)[image_idx]) for name in ("width", "height"))
         fx, fy, cx, cy = (float(getattr(cameras, name)[image_idx]) for name in ("fx", "fy", "cx", "cy"))
@@ -64,12 +64,12 @@ class ThermalDataset(InputDataset):
         return cameras.camera_to_worlds[image_idx].double().numpy()
 
     def views(self, thermal: bool = False) -> Views:
-        """Return the photographs' cameras, or with `thermal` those in `thermal_cameras`, as views."""
+        """Return all photographs' cameras and poses as `Views`; with `thermal`, those in `thermal_cameras`."""
         numbers = range(len(self))
         return Views.of([self.camera(n, thermal) for n in numbers], [self.pose(n, thermal) for n in numbers])
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
-        """Return a photograph at the resolution of its camera, shape (h, w, 3), or raise `SceneError`."""
+        """Return a photograph at its camera's resolution, (h, w, 3); raise `SceneError` if transparent or not 8-bit."""
         path = self._dataparser_outputs.image_filenames[image_idx]
         with errors_name(path, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(path) as opened:
             opened.load()
@@ -103,7 +103,7 @@ class ThermalDataset(InputDataset):
         return data
 
     def _fitted(self, cameras: Cameras, image_idx: int) -> Cameras:
-        """Return one of `cameras`, shape (1,), moved with its photograph from the given pose to the fitted pose."""
+        """Return one of `cameras`, (1,), moved by the motion of its photograph from the given to the fitted pose."""
         moved = deepcopy(cameras[image_idx : image_idx + 1])
         given, own = (_square(c.camera_to_worlds[image_idx]) for c in (self.cameras, cameras))
         pose = _square(self.metadata["fitted_poses"][image_idx]) @ torch.linalg.inv(given) @ own
@@ -127,7 +127,7 @@ class ThermalDataset(InputDataset):
         return torch.from_numpy(resized > 0)[..., None]
 
     def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
-        """Return normalised temperatures, 0 where invalid (all, without a thermal image), and a mask of valid ones."""
+        """Return normalised temperatures and a mask of valid pixels; both are 0 everywhere without a thermal image."""
         if self.temperature_range is None:
             size = int(self.cameras.height[image_idx]), int(self.cameras.width[image_idx]), 1
             return torch.zeros(size), torch.zeros(size, dtype=torch.bool)
@@ -147,14 +147,14 @@ class ThermalDataset(InputDataset):
         return self._thermal[image_idx]
 
     def thermal_report(self) -> str:
-        """Return in words how many pixels of the split's thermal images are masked."""
+        """Return a text for the log: how many pixels of the split's thermal images are masked."""
         for index in range(len(self)):
             self.get_thermal(index)
         masked, pixels = (sum(count) for count in zip((0, 0), *self._masked.values()))
         return f"{masked} of {pixels} pixels masked ({masked / max(pixels, 1):.2%})"
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:
-        """Return a picture at the camera's resolution; a last fraction of a pixel is cut off, as in `Camera.scaled`."""
+        """Return `picture` at the resolution of camera `image_idx`; a last fraction of a pixel is cut off."""
         width, height = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         if picture.size == (width, height):
             return picture
@@ -164,9 +164,9 @@ class ThermalDataset(InputDataset):
 
 
 def _averaged(values: FloatArray, valid: BoolArray, side: int) -> tuple[FloatArray, BoolArray]:
-    """Return the mean of the valid values (h, w) of each block of `side` x `side` pixels, and where it has one.
+    """Return each block's mean of its valid `values` (h, w), and a mask of the blocks with a valid value.
 
-    Without a valid pixel the mean is 0. A last fraction of a block is cut off, as in `Camera.scaled`.
+    A block has `side` x `side` pixels. Without a valid value its mean is 0. A last fraction of a block is cut off.
     """
     height, width = (length // side for length in values.shape)
 

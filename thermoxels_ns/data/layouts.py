@@ -1,4 +1,4 @@
-"""Layouts of scene folders: how each is recognised, and what stands for the transforms.json of those without one."""
+"""Layouts of scene folders: recognises a folder's layout, and makes up a transforms.json for layouts without one."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _THERMAL_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout of scene folders: by what it is recognised, and where its parts are."""
+    """A layout of scene folders: the signs by which it is recognised, and the places of its parts."""
 
     name: LayoutName
     marks: tuple[str, ...]
-    """Files, folders or keys of frames in a json (``frames with KEY``), one of which must be there; none: all fit."""
+    """Signs, of which a folder must have one: files, folders or keys of frames (``frames with KEY``); empty: none."""
     thermal: tuple[str, ...] = ("thermal",)
-    """Folders of thermal files, best first; a file belongs to the photograph with its stem. None: photographs alone."""
+    """Folders of thermal files, the first that exists is used; empty: photographs alone. Stems name the photographs."""
     photographs: tuple[str, ...] = ()
-    """Folders of photographs, one of which must be there, with poses from COLMAP; none: a json names and poses them."""
+    """Folders of photographs, one of which must exist, if poses are COLMAP's; empty: a json names and poses them."""
 
 
 LAYOUTS = (
@@ -47,25 +47,25 @@ LAYOUTS = (
     Layout("rgb", (), ()),
     Layout("rgb", (), (), ("images", "rgb")),
 )
-"""All layouts, in the order in which they are tried; the first that fits a folder is its layout."""
+"""All layouts in the order in which they are tried; the first that fits a folder is the folder's layout."""
 
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where the parts of a scene are, and its json or what stands for it."""
+    """Places of a scene's parts, and the content of its transforms.json, which is made up if the scene has none."""
 
     layout: Layout
     folder: Path
     origin: Path  # the json, or the folder of the COLMAP model
-    content: dict[str, Any]  # as in transforms.json
+    content: dict[str, Any]  # content in the form of transforms.json
     thermal: Path | None  # folder of thermal files; None: no such folder
     left_out: list[str] = field(default_factory=list)  # names of photographs that only the COLMAP model has
 
 
 def scene_json(data: Path) -> tuple[Path | None, dict[str, Any]]:
-    """Return the json of a scene folder, or `data` if it is one itself, and its content, unchecked; None and {}: none.
+    """Return path and unchecked content of a scene folder's json; None and {} if there is none, as with COLMAP.
 
-    COLMAP scenes have none. Raises `SceneError` if it cannot be read.
+    `data` is the folder or the json itself. Raises `SceneError` if the json cannot be read.
     """
     named = [data] if data.is_file() and data.suffix == ".json" else [data / name for name in JSON_NAMES]
     path = next((path for path in named if path.is_file()), None)
@@ -73,10 +73,9 @@ def scene_json(data: Path) -> tuple[Path | None, dict[str, Any]]:
 
 
 def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
-    """Recognise the layout of a scene folder (or of that of a json), or take the one that is `wanted`.
+    """Return the parts of the scene at `data`, a folder or a json, in the layout `wanted`; None: the first that fits.
 
-    Raises:
-        SceneError: There are no poses, or not the parts of the layout; the json or the COLMAP model cannot be used.
+    Raises `SceneError` if poses or parts of the layout are missing, or the json or COLMAP model cannot be used.
     """
     json_path, content = scene_json(data)
     folder = data if json_path is None else json_path.parent
@@ -115,7 +114,7 @@ def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
 
 
 def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
-    """Return in words what tells of thermal images in a scene that looks like photographs alone; empty: nothing."""
+    """Return a text that lists signs of thermal images in a scene without a thermal layout; empty if there are none."""
     keys = [key for key in ("thermal_camera", "thermal_unit") if key in content]
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
     named = [f"{name}/" for name in folders if "therm" in name.lower() or name == "raw_images"]
@@ -123,8 +122,12 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 
 
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
-    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, and the names of
-    those that are not there or not clear (`matched_names`). Subfolders train, val and test become split lists."""
+    """Return the COLMAP model `place` in the form of transforms.json, and the names of images that are left out.
+
+    Images are matched with the photographs in ``folder / root``; images without a clear match (`matched_names`) are
+    left out. Photographs in subfolders val and test are also listed in ``val_filenames`` and ``test_filenames``.
+    Raises `SceneError` if no image has a match.
+    """
     from PIL import Image  # the help of commands does not need it
 
     cameras, images, _ = read_model(place)
@@ -154,8 +157,12 @@ def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, A
 
 
 def _paired(content: dict[str, Any], name: str, alone: bool) -> dict[str, Any]:
-    """Return the content of a ThermalNeRF json with one frame per pair: photograph i of n and thermal image n + i, or
-    the thermal image with its stem; photographs `alone` without. Raise `SceneError` for unequal numbers of both."""
+    """Return the content of a ThermalNeRF json, which has a frame per image, with one frame per pair.
+
+    The i-th photograph's partner is the thermal image with its stem, else the i-th thermal image. With `alone`, there
+    are no pairs: the frames are the photographs. `name` names the json in messages. Raises `SceneError` if there are
+    not as many thermal images as photographs (but with `alone`).
+    """
     frames = content["frames"]
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
         return content  # the reader of frames says which is wrong

@@ -26,12 +26,12 @@ _GRID_RAYS = 1 << 14  # most rays of a bundle of `grid`
 
 
 class RaySampler:
-    """The pixels of a `ThermalDataset` in memory, from which rays are drawn at random or on a regular grid.
+    """All pixels of a `ThermalDataset` in memory. Rays through them are drawn at random or on a regular grid.
 
-    If photographs and thermal images share cameras, a ray through a photograph's pixel carries both targets, and the
-    thermal target only where the thermal pixel is valid. Else the thermal cameras have rays of their own, through valid
-    pixels. Photographs are decoded at the first draw, so that grids, which need no colour, are cheap. Tables are kept
-    on the device `storage`; batches are moved to `device`. `streams` names the images that train.
+    If photographs and thermal images share cameras, a ray carries a colour and, if its thermal pixel is valid, also a
+    temperature. Otherwise the thermal cameras have rays of their own, through valid pixels. Photographs are decoded at
+    the first draw: a grid needs no colours and is cheap. Tables are kept on the device `storage`; batches are moved to
+    `device`. `streams` names the images that train.
     """
 
     def __init__(
@@ -82,21 +82,19 @@ class RaySampler:
         return colours.to(self.storage)
 
     def load(self) -> None:
-        """Decode all photographs and make the tables of rays, as far as the streams need them."""
+        """Decode all photographs and make the tables of rays, if the streams that train need them."""
         if self.streams != "thermal":
             _ = self._colours
         if self.streams != "rgb":
             _ = self.thermal_rays
 
     def draw(self, generator: torch.Generator, rgb_rays: int, thermal_rays: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Draw rays through random pixels, with replacement and an equal chance for every usable pixel.
+        """Return random rays and their targets. Pixels are drawn with replacement, all usable ones with equal chance.
 
-        `rgb_rays` go through photographs, `thermal_rays` through thermal images. With shared cameras `thermal_rays` is
-        ignored, and if `streams` is "thermal" besides, `rgb_rays` go through valid thermal pixels.
-
-        Returns:
-            The rays (colour first, then thermal only), and their targets ``image`` (n, 3) in [0, 1] and ``thermal``
-            (n, 1), normalised, both float32 and 0 where the ray has no such target.
+        `rgb_rays` and `thermal_rays` are the numbers of rays through photographs and thermal images. With shared
+        cameras, `thermal_rays` is ignored; if `streams` is then "thermal", `rgb_rays` rays go through valid thermal
+        pixels. Rays through photographs come first. The targets are ``image`` (n, 3) in [0, 1] and ``thermal`` (n, 1),
+        normalised, both float32, and 0 for a ray without this target.
         """
         columns: list[dict[str, Tensor]] = []
         bits, images, temperatures = [], [], []
@@ -125,7 +123,7 @@ class RaySampler:
         return self._bundle(rays, torch.cat(bits)), batch
 
     def grid(self, stream: int, max_rays_per_image: int | None) -> Iterator[RayBundle]:
-        """Yield rays through the usable pixels of a regular grid, see `ThermalDataManager.training_rays`."""
+        """Yield bundles of rays through the usable pixels of a grid, see `ThermalDataManager.training_rays`."""
         if not 0 < stream <= RGB_STREAM | THERMAL_STREAM:
             raise ValueError(f"no such stream: {stream}")
         wanted = stream & _BITS[self.streams]
@@ -160,15 +158,15 @@ class RaySampler:
 
 
 def draw_generator(*key: int) -> torch.Generator:
-    """Return a random generator on the CPU whose numbers depend on `key` alone (non-negative integers).
+    """Return a random generator on the CPU, seeded with a hash of `key` (non-negative integers).
 
-    The key is hashed, because torch seeds its CPU generator with 32 bits only.
+    The hash has 32 bits, because torch seeds its CPU generator with no more.
     """
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
 
 def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> Int[Tensor, " usable"] | None:
-    """Return the numbers of the usable pixels; None if all are usable. Raises `SceneError` if none is."""
+    """Return the indices of the usable pixels; None if all (or a mask None) are. Raises `SceneError` if none is."""
     if usable is None or bool(usable.all()):
         return None
     numbers = usable.nonzero()[:, 0]
@@ -178,14 +176,12 @@ def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> 
 
 
 class CameraRays:
-    """Rays of all pixels of `cameras`, numbered camera by camera, rows from the top, columns from the left.
+    """Rays of all pixels of n `cameras`, numbered camera by camera, rows from the top, columns from the left.
 
-    Directions in camera axes depend on the intrinsics alone, so cameras with equal intrinsics share one table, and a
-    ray costs one look-up and one rotation. nerfstudio's `Cameras.generate_rays` fills the table, so that lens
-    distortion is the same as in evaluation.
-
-    Attributes:
-        first_pixel: Number of the first pixel of each camera and, last, the number of all pixels, shape (n + 1,).
+    Directions in camera axes depend on the intrinsics alone. Cameras with equal intrinsics therefore share one table of
+    directions, and a ray costs one look-up and one rotation. nerfstudio's `Cameras.generate_rays` fills the table, so
+    that lens distortion is the same as in evaluation. `first_pixel` (n + 1,) is the number of each camera's first pixel
+    and, as last entry, the number of all pixels.
     """
 
     def __init__(self, cameras: Cameras, device: torch.device | str = "cpu") -> None:
@@ -216,8 +212,11 @@ class CameraRays:
         return int(self.first_pixel[-1])
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
-        """Return rays through the centres of `pixels`, numbers (n,) on `self.device`, as fields of `RayBundle`: origins
-        (n, 3), unit directions (n, 3), camera_indices (n, 1), and pixel_area (n, 1) as in the middle of the image."""
+        """Return fields of `RayBundle` by name for the rays through the centres of the pixels numbered `pixels` (n,).
+
+        They are origins (n, 3), unit directions (n, 3), camera_indices (n, 1), and pixel_area (n, 1), the area at
+        distance 1 that a pixel in the middle of the image covers. `pixels` must be on `self.device`.
+        """
         image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
         place = pixels + self._table_shift.index_select(0, image)
         camera_axes = self._directions.index_select(0, place)[..., None]
@@ -229,10 +228,10 @@ class CameraRays:
         }
 
     def grid(self, most: int | None) -> Int[Tensor, " n"]:
-        """Return the numbers of every n-th pixel in both directions, in ascending order, at most `most` in an image.
+        """Return the numbers of every k-th pixel in both directions of each image, in ascending order.
 
-        Each image has the least such n. The grid starts in the middle of its first cell, so that it prefers no border.
-        Along a side shorter than n, the grid has the middle pixel alone.
+        In each image, k is the smallest step that gives at most `most` pixels (None: k = 1). The grid starts in the
+        middle of its first cell, so that no border is preferred. Along a side shorter than k, only the middle is used.
         """
         if most is not None and most < 1:
             raise ValueError(f"at most {most} rays of an image")
@@ -247,9 +246,9 @@ class CameraRays:
         return torch.cat(numbers).to(self.device)
 
     def _camera_axes(self, index: int) -> Float[Tensor, "pixels 3"]:
-        """Return the ray directions in camera axes of all pixels of one camera.
+        """Return unit ray directions in camera axes for all pixels of camera `index`, (pixels, 3).
 
-        Raises `SceneError` if the distortion cannot be undone in a pixel.
+        Raises `SceneError` if the lens distortion cannot be undone in a pixel.
         """
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]

@@ -1,4 +1,4 @@
-"""The scene box, which the voxel lattice fills: given, or found from points, depths of photographs, or cameras."""
+"""The scene box, in which the voxel lattice lies: given, or found from points, depths of photographs, or cameras."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
 _TAIL = 0.5
-"""Points left outside the box at either end of an axis, [%]: some are wrong. Chosen on a drawn block before far walls,
-of whose depths 0.7 % are; with 0.1 its box is 1.5 times as long. A mast of fewer points is held by `_MARGIN` alone."""
+"""Points left outside the box at either end of an axis, [%], because some are wrong. It was chosen on a synthetic block
+before far walls, with 0.7 % wrong depths: 0.1 makes its box 1.5 times as long. A mast of fewer points has `_MARGIN`."""
 _MARGIN = 0.08  # Width added on every side, relative to the longest side of the box
 _ROUNDED = 2.0**-8  # Corners are rounded to this share of the longest side, or less
 _MOST_POINTS = 20_000  # About as many of the points are used
@@ -31,24 +31,24 @@ _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are found, and pixels along their longer side; this takes some seconds."""
 _FEWEST_POINTS = 10  # Sparse points in view that a box needs
 _FEWEST_DEPTHS = 200  # Depths that a box needs; with fewer it is found from the cameras
-_FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the photograph with most, tells nothing
-_NEARER_HALF = 0.25  # Where no points are known, the surface is taken to stand at this quantile of the depths in a box
-_CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer than this, relative to their spread
+_FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the photograph with most, is a blind one
+_NEARER_HALF = 0.25  # Without points, the surface is assumed at this quantile of the depths in the box
+_CONVERGING = 0.5  # Cameras look outwards if the point they look at is nearer than this share of their spread
 
 
 @dataclass(frozen=True, eq=False)
 class FoundBox:
     """The scene box in input coordinates, and what it was found from."""
 
-    source: str  # What the box was found from, in words
+    source: str  # Text for the log: what the box was found from
     box: Box
     points: FloatArray | None = None  # Points of the scene, shape (n, 3); None: not known
 
     def pixel_size(self, frames: Sequence[Frame]) -> float:
         """Return the width that a pixel covers at the typical distance of surfaces in the box, in input units.
 
-        This is the median over the points in the box and the photographs that have them in view; without points, the
-        width of a pixel in the middle of the nearer half of the box. Infinite if no camera sees the box.
+        It is the median of depth / focal length over the points in the box and the photographs that have them in view;
+        without points, the quantile `_NEARER_HALF` over a grid in the box. It is infinite if no camera sees the box.
         """
         low, high = self.box
         if self.points is not None:
@@ -68,14 +68,12 @@ class FoundBox:
 def find_scene_box(
     scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int], tracks: SparseTracks | None
 ) -> FoundBox:
-    """Return the scene box and what it was found from.
+    """Return the scene box in input coordinates, and what it was found from.
 
-    The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
-    (``ply_file_path``, or those of `tracks`), depths on which the photographs that train (indices `training`) agree,
-    the cameras. The same folder and split give the same result.
-
-    Raises:
-        SceneError: A box has no volume or is not finite, a file cannot be read, or neither points nor cameras suffice.
+    The first available source is used: `option`, two corners; ``scene_box`` in the json; sparse points
+    (``ply_file_path``, or the points of `tracks`); depths on which the photographs that train (indices `training`)
+    agree; the cameras. The same folder and split give the same result. Raises `SceneError` if a box has no volume or is
+    not finite, if a file cannot be read, or if neither points nor cameras suffice.
     """
     frames = scene.frames
     if option is not None:
@@ -100,7 +98,7 @@ def find_scene_box(
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
-    """Return points (n, 3) on which photographs agree, in input coordinates, and how many photographs are compared."""
+    """Return stereo points (n, 3) on which photographs agree, in input coordinates, and the number of photographs."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
     frames = _spread(frames, _STEREO_PHOTOGRAPHS)
@@ -116,14 +114,13 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
 
 
 def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
-    """Return the box around the points (n, 3), in input coordinates, that photographs show well.
+    """Return the box around those of the points (n, 3), in input coordinates, that photographs show well.
 
-    Points count that photographs show about as well as what cameras are pointed at, the rule by which the export picks
-    its region, too: see `Views.shown_well`. A camera is pointed at the median depth of the points in its view. Along
-    each axis the box leaves out `_TAIL` of the points at either end, and is then wider by `_MARGIN` on every side,
-    because parts without texture have no points and a flat scene needs some depth. If a photograph has hardly any of
-    these points in view, as of a plain wall, the box also holds the point on its optical axis at the median distance of
-    what the other cameras are pointed at.
+    `Views.shown_well` decides which points photographs show well; the export chooses its region by the same rule. Each
+    camera is taken to be pointed at the median depth of the points in its view. Along each axis, `_TAIL` of the points
+    at either end are left out, and `_MARGIN` is added on both sides, because parts without texture have no points and a
+    flat scene needs some depth. If a photograph, as of a plain wall, has hardly any of these points in view
+    (`_FEW_IN_VIEW`), the box is extended to the point on its optical axis at the median of the cameras' depths.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
@@ -168,12 +165,10 @@ def _spread(frames: Sequence[Frame], most: int) -> list[Frame]:
 def box_of_cameras(frames: Sequence[Frame]) -> Box:
     """Return a cube as scene box, guessed from the cameras alone.
 
-    If cameras look at one place, the cube's centre is the point nearest to all optical axes (least squares). Half its
-    side is the median over the cameras of the distance to the centre times the tangent of half the field of view. If
-    cameras look outwards, as in a room, the cube lies around the cameras and its side is four times their extent.
-
-    Raises:
-        SceneError: All cameras look in one direction, or look outwards from one place.
+    If the cameras look at one place, the cube's centre is the point nearest to all optical axes (least squares). Half
+    the cube's side is the median, over the cameras, of the centre's depth times the tangent of half the field of view.
+    If the cameras look outwards, as in a room, the cube lies around them and its side is four times their extent.
+    Raises `SceneError` if all cameras look in one direction, or look outwards from one place.
     """
     axes, origins = (np.stack([frame.pose[:3, column] for frame in frames]) for column in (2, 3))
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

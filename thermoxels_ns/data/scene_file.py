@@ -28,23 +28,21 @@ _HOTTEST_C = 10_000  # no thermal camera measures more
 class Frame:
     """One photograph with its thermal image, pose and camera."""
 
-    name: str  # `file_path` of the photograph in the json, with forward slashes; frames are sorted by name
+    name: str  # `file_path` of the photograph in the json, with forward slashes
     image: Path
     thermal: Path | None  # None in a scene of photographs alone
-    mask: Path | None  # image that is white where the photograph may be used; None: no mask
-    pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes, input coordinates
+    mask: Path | None  # image that is white in pixels of the photograph that may be used; None: no mask
+    pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes (x right, y up, z back), input coordinates
     intrinsics: Camera  # camera of the photograph
     thermal_pose: FloatArray | None  # pose of the thermal camera, as `pose`; None: the photograph's
     thermal_intrinsics: Camera | None
     """Camera of the thermal image; None: the photograph's, scaled to the thermal image's resolution."""
 
     def read_picture(self, mode: Literal["RGB", "L"], longest_side: int) -> tuple[Image.Image, Image.Image | None]:
-        """Read the photograph in colour or grey, and its mask at the size of the result; None: no mask.
+        """Return the photograph in colour or grey, and its mask at the photograph's returned size (None: no mask).
 
-        A large JPEG is decoded at a fraction of its size, but with no fewer than `longest_side` pixels along that side.
-
-        Raises:
-            SceneError: A file cannot be read.
+        A large JPEG is decoded at a fraction of its size, but with at least `longest_side` pixels on its longest side.
+        Raises `SceneError` if a file cannot be read.
         """
         with errors_name(self.image, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(self.image) as opened:
             opened.draft(mode, (longest_side, longest_side))
@@ -64,9 +62,9 @@ class SceneFile:
     frames: list[Frame]  # sorted by name
     unit: ThermalUnit  # unit of the numbers in thermal files
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
-    meta: dict[str, Any]  # the json (split lists, scene_box, ply_file_path, ...), or what stands for it
+    meta: dict[str, Any]  # content of the json (split lists, scene_box, ply_file_path, ...), see `SceneSource.content`
     left_out: list[str] = field(default_factory=list)  # names of frames that missing_thermal="skip" left out
-    layout: str = ""  # the layout and where its parts are, in words
+    layout: str = ""  # text for the log: the layout and the places of its parts
 
     @property
     def has_thermal(self) -> bool:
@@ -81,15 +79,13 @@ def read_scene_file(
     layout: LayoutName | None = None,
     thermal_bounds: tuple[float, float] | None = None,
 ) -> SceneFile:
-    """Read a scene folder (or the json in it) and check everything that can be checked without decoding images.
+    """Return the content of a scene folder (or of the json in it), with all checks that need no decoded image.
 
-    `layout` is one of `thermoxels_ns.data.layouts`; None: the first that fits. The thermal image of a photograph is the
-    file that `thermal_file_path` names, else the file with the same stem in the layout's folder of thermal files.
-    `missing_thermal` "skip" leaves out frames without a thermal image and lists them in `SceneFile.left_out`.
+    `layout` is one of `thermoxels_ns.data.layouts`; None: the first that fits. A photograph's thermal image is the file
+    that `thermal_file_path` names, else the file with the same stem in the layout's folder of thermal files. With
+    `missing_thermal` "skip", frames without a thermal image are left out and listed in `SceneFile.left_out`.
     `thermal_bounds`, the temperatures [degrees Celsius] of black and white, replace those of temperature_bounds.json.
-
-    Raises:
-        SceneError: An entry or a file is missing, doubled, not finite or contradictory; the message names it.
+    Raises `SceneError` if an entry or a file is missing, doubled, not finite or contradictory; the message names it.
     """
     source = find_source(data, layout)
     json_path, folder, meta = source.origin, source.folder, source.content

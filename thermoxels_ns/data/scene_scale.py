@@ -29,7 +29,7 @@ class SceneScale:
     source: str  # Source of the scale, as a sentence
 
     def standard_error_of(self, size: float, power: int) -> float | None:
-        """Return the standard error, to first order, of an area (`power` 2) or a volume (3) in metres; None: unknown.
+        """Return the first-order standard error of an area `size` [m2] (`power` 2) or volume [m3] (3); None: unknown.
 
         >>> SceneScale(2.0, 0.02, "").standard_error_of(10.0, 3)
         0.3
@@ -69,9 +69,9 @@ def scale_from_known_distance(
 ) -> SceneScale:
     """Return the scale from two points of the scene [input units] and their measured distance [m].
 
-    The scale is the measured distance over the distance of the points, with the same relative standard error. Include
-    in `standard_error_m` how far the points may lie from the ends of the measured length. None: not known.
-    Raises `ThermoxelsError` if a number is out of range, or the points coincide.
+    The scale is the measured distance over the distance of the points. Its relative standard error is that of the
+    measured distance; `standard_error_m` (None: unknown) should include how far the points may be from its ends.
+    Raises `ThermoxelsError` if a number is out of range, or if the points coincide.
 
     >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
     0.02
@@ -90,7 +90,7 @@ def scale_from_known_distance(
 
 
 def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
-    """Return the scale in a scene's json, None if the json has none; raises `SceneError` for wrong values."""
+    """Return the scale in a json's content `meta`, None if it has none. Raises `SceneError` for wrong values."""
     found = _in_file(meta)
     value = found.metres_per_unit
     if value is None:
@@ -99,7 +99,7 @@ def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
 
 
 def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
-    """Return the unit vector up in a scene's json, None if the json has none; raises `SceneError` for a wrong one.
+    """Return the unit vector ``up`` of a json's content `meta`, None if it has none. Raises `SceneError` if it is bad.
 
     >>> up_from_scene_file({"up": [0, 0, 2]})
     (0.0, 0.0, 1.0)
@@ -120,10 +120,10 @@ def _in_file(meta: Mapping[str, Any]) -> _InFile:
 def choose_scale(
     option: float | None = None, known_distance: SceneScale | None = None, scene_file: Mapping[str, Any] | None = None
 ) -> SceneScale | None:
-    """Return the scale that the user gives, else the scale in the scene's json; None if there is neither.
+    """Return the user's scale, else the scale in the json's content `scene_file`; None if there is neither.
 
-    The user gives `option`, in metres per unit, or `known_distance`; giving both, or an option not above 0, raises
-    `ThermoxelsError`. If the json has a scale too, the source of the result says that the user's goes before it.
+    The user's scale is `option` [metres per unit] or `known_distance`. Raises `ThermoxelsError` if both are given, or
+    if `option` is not above 0. If the json has a scale too, the text `source` says that the user's replaces it.
     """
     if option is not None and known_distance is not None:
         remedy = "Leave one of them out."

@@ -17,12 +17,12 @@ from thermoxels_ns.data.transforms_json import read_pose
 
 FEWEST_VIEWS = 3  # photographs that must see a point: two photographs agree on many wrong points
 MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, [pixels]
-LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
+LEAST_ERROR_PX = 0.3  # smaller reprojection errors of points are due to chance and are raised to this, [pixels]
 LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
-MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
+MOST_BEHIND = 0.1  # if a larger share of sightings is behind the camera, the tracks belong to other poses
 MOST_OFF = 0.002
-"""A photograph is left out if an axis of its camera in the model is off the given one by more than this, or its place
-by more than this share of the cameras' distance from their middle."""
+"""A photograph is left out if a component of its camera axes in the model differs from the given one by more than this,
+or a coordinate of its camera by more than this share of the largest distance of a camera from the cameras' mean."""
 LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
 TrackSource = Literal["auto", "off"]
 
@@ -37,7 +37,7 @@ class SparseTracks:
     source: str = "tracks"  # folder of the COLMAP model
 
     def well_seen(self) -> FloatArray:
-        """Return the points (m, 3) that enough photographs see with a small enough error (see `feature_rays`)."""
+        """Return the points (m, 3) that `FEWEST_VIEWS` photographs see with an error of at most `MOST_ERROR_PX`."""
         views = np.bincount(np.concatenate([*self.seen.values()]), minlength=len(self.points))
         return self.points[(views >= FEWEST_VIEWS) & (self.point_error_px <= MOST_ERROR_PX)]
 
@@ -45,12 +45,10 @@ class SparseTracks:
 def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseTracks | None:
     """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
 
-    Photographs are matched by name. The json's poses must be those of the model, moved by the json's
-    ``applied_transform`` if it has one. Two poses of a photograph agree if they differ by less than `MOST_OFF`.
-    Sightings of photographs whose poses do not agree are left out, and `say` receives their names.
-
-    Raises:
-        SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
+    Photographs are matched by name. Their poses in the scene must agree, within `MOST_OFF`, with those in the model
+    after the json's ``applied_transform`` if it has one. Photographs whose poses do not agree are left out of the
+    tracks, and `say` receives their names. Raises `SceneError` if the model is damaged or is not of these photographs,
+    or if too few poses agree.
     """
     folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
     if folder is None:
@@ -99,15 +97,13 @@ def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseT
 
 
 def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
-    """Return the feature rays from `frames` (at least one) to the points in `tracks` whose places are well known.
+    """Return the feature rays from `frames` (at least one) to the points in `tracks` whose positions are well known.
 
-    A point counts if at least `FEWEST_VIEWS` frames see it, from directions more than `LEAST_PARALLAX_DEG` apart, with
-    a mean reprojection error of at most `MOST_ERROR_PX`. A counting point that does not agree with its neighbours
-    (`agrees_with_neighbours`) is kept without rays, as wrong rays would turn walls into air. The standard error of a
-    ray's length is that of triangulation: reprojection error / focal length / sine of the angle, times the length.
-
-    Raises:
-        SceneError: No frame is in `tracks`, or `tracks` are of other poses.
+    A point is used if at least `FEWEST_VIEWS` frames see it, from directions more than `LEAST_PARALLAX_DEG` apart, with
+    a mean reprojection error of at most `MOST_ERROR_PX`. A used point that does not agree with its neighbours
+    (`agrees_with_neighbours`) is kept without rays, because wrong rays would turn walls into air. The standard error of
+    a ray's length is that of triangulation: length * reprojection error / focal length / sine of the angle.
+    Raises `SceneError` if no frame is in `tracks`, or if `tracks` belong to other poses.
     """
     seen = [tracks.seen.get(one.name, np.zeros(0, dtype=np.int64)) for one in frames]
     point, frame = np.concatenate(seen), np.repeat(np.arange(len(frames)), [len(some) for some in seen])
@@ -137,7 +133,10 @@ def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
-    """Return twice the largest angle between a point's directions and their mean, shape (count,), [radians]."""
+    """Return, for each of `count` points, twice the largest angle between its directions and their mean [radians].
+
+    The unit `directions` (n, 3) belong to the points with the indices `point` (n,). A point without directions gets 0.
+    """
     mean = np.stack([np.bincount(point, directions[:, axis], count) for axis in range(3)], axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     off = np.zeros(count)

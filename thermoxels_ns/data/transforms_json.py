@@ -27,8 +27,8 @@ _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
     """Return a camera-to-world matrix (4, 4) from 3 x 4 or 4 x 4 numbers of a json; `where` names them in messages.
 
-    Raises `SceneError` unless the numbers are finite, the camera's coordinates are within `MOST_UNITS`, a fourth row is
-    0, 0, 0, 1, and the upper left 3 x 3 is a rotation. With `turned` False the upper left may be any matrix.
+    Raises `SceneError` unless all numbers are finite, the camera's coordinates are within `MOST_UNITS`, a fourth row is
+    0, 0, 0, 1, and the upper left 3 x 3 is a rotation. If `turned` is False, the upper left may be any matrix.
     """
     try:
         entries = np.array(values, dtype=object)
@@ -57,8 +57,11 @@ def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
 
 
 def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
-    """Return a frame's camera from its json `entry`, else from the scene's `meta`; missing w and h are the `image`'s.
-    Raises `SceneError`, naming `where`, for values that are missing, that no lens has, or that do not fit `image`."""
+    """Return a frame's camera from the json: each value is that of its `entry`, else that of the scene's `meta`.
+
+    Missing w and h are the width and height of the file `image`; None: no file to compare with. Raises `SceneError`,
+    which names `where`, for values that are missing, that no lens has, or that do not fit `image`.
+    """
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")

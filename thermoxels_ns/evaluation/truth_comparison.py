@@ -29,9 +29,9 @@ from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
-TOLERANCE_VOXELS = 1.5  # Two surfaces agree where their distance is at most this, [voxels]
+TOLERANCE_VOXELS = 1.5  # A point agrees with the other surface if it is at most this far from that surface, [voxels]
 DEPTH_TOLERANCE = 0.02  # A depth is off if it differs from the true depth by more than this share of the true depth
-COMMON_RESOLUTION = 128  # Voxels in the exact box's longest side, for the tolerance of `fscore_128`
+COMMON_RESOLUTION = 128  # `TOLERANCE_VOXELS` of `fscore_128` are of voxels of which so many span the exact box
 
 _SURFACE_POINTS = 20_000
 _PER_SIDE = 2  # Sample points along each side of a voxel's face
@@ -48,7 +48,7 @@ class SurfaceScore:
     """Share of the true surface seen by cameras that is within the tolerance of the reconstructed boundary, 0 to 1."""
     share: float = 0.0  # Share of the reconstructed boundary that is scored, 0 to 1
     mean_distance: float | None = None
-    """Mean distance of the scored boundary to the true surface, [truth units]; None where it was not measured."""
+    """Mean distance of the scored boundary to the true surface, [m]; None if it was not measured."""
 
     @property
     def fscore(self) -> float:
@@ -57,8 +57,11 @@ class SurfaceScore:
 
 
 def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Return points on the faces between solid and empty voxels, (n, 3) [corner indices], the empty voxel in front of
-    each point (n, 3), and whether that voxel is outside the lattice or the region `within` (n,)."""
+    """Return sample points on the faces between solid `cells` and empty cells, `_PER_SIDE` squared on each face.
+
+    Returns the points (n, 3) [corner indices], the index of the empty cell in front of each point (n, 3), and a mask
+    (n,), True if that empty cell is outside the lattice or outside the region `within` (a mask like `cells`).
+    """
     steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
     for axis in range(3):
         rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)
@@ -75,7 +78,7 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Return points spread evenly by area over the triangles `facets` (f, 3), the same in each call, (count, 3)."""
+    """Return random points (count, 3), uniform by area, on the triangles `facets` (f, 3), with a fixed seed."""
     from trimesh import Trimesh
     from trimesh.sample import sample_surface
 
@@ -92,9 +95,9 @@ class KnownTruth:
 
     @cached_property
     def points_seen(self) -> FloatArray:
-        """Points spread evenly over the part of the true surface that `MIN_VIEWS` training cameras see, (m, 3), [m].
+        """Random points (m, 3) [m], uniform by area, of the true surface that `MIN_VIEWS` or more training cameras see.
 
-        Raises `SceneError` if no point is seen by so many cameras.
+        Raises `SceneError` if none of the points is seen by so many cameras.
         """
         points, normals = self.scene.solid.surface_points(_SURFACE_POINTS, seed=0)
         seen = visible_surface_points(self.scene, self.training_poses, self.camera, points, normals, MIN_VIEWS)
@@ -113,20 +116,20 @@ class KnownTruth:
         tolerance_m: float,
         within: BoolArray | None = None,
     ) -> tuple[SurfaceScore, SurfaceScore]:
-        """Return two scores of the boundary of solid voxels against the surface: of all faces, and of the seen ones.
+        """Return the score of the boundary of solid voxels against the true surface, and the score of its seen faces.
 
-        Enclosed cavities are filled first, as no camera sees into them, but for rooms in which a camera stands. The
-        boundary is sampled at four points per voxel face. Faces at the end of the lattice or of the region `within` cut
-        the scene; they do not count for precision. Neither does boundary near the surroundings and not near the body:
-        photographs do not say where the body ends and its surroundings begin. A face is seen if `MIN_VIEWS` cameras
-        have a free line, past the solid voxels, to the empty voxel in front of it.
+        Enclosed cavities are filled first, because no camera sees into them, except rooms in which a camera stands. The
+        boundary is sampled at four points per voxel face. Two kinds of faces do not count for precision: those at the
+        end of the lattice or of the region `within`, which cut the scene; and those near the surroundings and not near
+        the body (see `counts`). A face is seen if at least `MIN_VIEWS` cameras have a line of sight, free of solid
+        voxels, to the empty voxel in front of the face.
 
         Args:
-            cells: Solid voxels, shape `lattice.cell_shape`.
+            cells: Mask of the solid voxels, shape `lattice.cell_shape`.
             lattice: Lattice of the voxels, [world units].
             world_to_truth: Similarity, shape (4, 4), from the lattice's world to the scene's coordinates.
-            tolerance_m: Distance up to which surfaces agree, above 0, [m].
-            within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
+            tolerance_m: Largest distance at which a point agrees with the other surface, above 0, [m].
+            within: Mask of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
         """
         cells = check_array("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
         views = self.views(world_to_truth)
@@ -154,13 +157,17 @@ class KnownTruth:
         return whole, SurfaceScore(float(agrees[shown].mean()), recall(inner[shown]), float(shown.mean()))
 
     def counts(self, points: FloatArray, agrees: BoolArray, tolerance_m: float) -> BoolArray:
-        """Return which points (n, 3) of a reconstructed boundary count: all that agree or are not at surroundings."""
+        """Return a mask (n,) of the boundary points (n, 3) [m] that count for precision.
+
+        These are all points that agree with the body (mask `agrees`), and all points farther than `tolerance_m` from
+        the surroundings: photographs do not say where the body ends and its surroundings begin.
+        """
         if self.scene.around is None:
             return np.ones(len(points), dtype=bool)
         return agrees | (self.scene.around.solid.signed_distance(points) > tolerance_m)
 
     def views(self, world_to_truth: FloatArray) -> Views:
-        """Return the training cameras in the world that the similarity (4, 4) brings to the scene's coordinates."""
+        """Return the training cameras in the coordinates from which the similarity `world_to_truth` (4, 4) maps."""
         poses = np.linalg.inv(world_to_truth) @ self.training_poses
         poses[:, :3, :3] *= _scale_of(world_to_truth)  # axes stay 1 long
         return Views.of([self.camera] * len(poses), list(poses))
@@ -173,7 +180,7 @@ def _scale_of(similarity: FloatArray) -> float:
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     """Return the synthetic scene and training cameras of a scene folder (or its json); None if it is not synthetic.
 
-    Raises `SceneError` for a json that is unreadable or names an unknown scene, and for frames that cannot be used.
+    Raises `SceneError` if a json is unreadable or names an unknown scene, or if frames are missing or cannot be used.
     """
     folder = Path(scene_folder)
     folder = folder.parent if folder.is_file() else folder
@@ -196,19 +203,18 @@ def compare_with_truth(
     metres_per_unit: float = 1.0,
     within: BoolArray | None = None,
 ) -> dict[str, Any] | None:
-    """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene; return the figures.
+    """Compare solid voxels, and optionally a mesh made from them, with the exact scene; return figures by name.
 
-    Scores are those of `KnownTruth.score` within `TOLERANCE_VOXELS`. Figures named ``..._seen`` are of the part of the
-    boundary that cameras see; they are 0 if cameras see none. `cells` has the shape `lattice.cell_shape`.
-    `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the input poses, in which a
-    synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
+    `cells` and `within` are masks as in `KnownTruth.score`, whose two scores are computed with a tolerance of
+    `TOLERANCE_VOXELS`. Figures named ``..._seen`` are of the part of the boundary that cameras see, and 0 if they see
+    none. `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the input poses,
+    which are metres in a synthetic scene. `truth` is a scene folder or what `load_known_truth` returned for it. The
+    mesh's nodes are divided by `metres_per_unit`, its scale.
 
     Returns:
-        Figures by name, which json can hold, in metres of the scene; None if the truth is not known. Scores are 0 to 1.
-        Mean distances go from the boundary to the true surface (None without a boundary). With a mesh also its volume
-        and area; ``chamfer_...`` between its surface and the seen true points; ``share_of_seen_reached``, the share of
-        these points within the tolerance of its surface; and ``temperature_seen_mae_c``, the mean absolute error [K]
-        where its surface is closest to these points.
+        Figures that json can hold, in metres of the scene; None if the truth is not known. Scores are 0 to 1. Mean
+        distances are from the boundary to the true surface (None without a boundary). With a mesh, the figures of
+        `mesh_errors` and ``chamfer_voxels`` are added.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -248,7 +254,7 @@ def compare_with_truth(
 def geometry_metrics(
     snapshot: GridSnapshot, world_to_input: FloatArray, known: KnownTruth, say: Callable[[str], None] = print
 ) -> dict[str, float]:
-    """Compare the surface that an export with default options would have with the exact scene; return scores by name.
+    """Return scores, by name, of the surface that an export with default options would have, against the exact scene.
 
     The surface is the boundary of the voxels that `SolidSelection` chooses by default. `world_to_input` (4, 4) is the
     similarity from the lattice's world to input coordinates. `say` receives the reason if no voxel is solid.
@@ -256,7 +262,8 @@ def geometry_metrics(
     Returns:
         ``fscore``, ``fscore_seen``, ``precision`` and ``recall`` of `compare_with_truth`; ``fscore_128`` and
         ``fscore_128_seen``, whose tolerance does not depend on the lattice (`COMMON_RESOLUTION`); and the mean distance
-        to the truth. If no voxel is solid: ``fscore``, ``precision``, ``recall`` and ``fscore_128``, all 0.
+        ``surface_distance_...`` from the surface to the true surface, in voxels and in m. If no voxel is solid:
+        ``fscore``, ``precision``, ``recall`` and ``fscore_128``, all 0.
 
     Raises:
         SceneError: No true point is seen by enough training cameras.
@@ -280,7 +287,7 @@ def geometry_metrics(
 
 @dataclass(frozen=True, eq=False)
 class RenderedRays:
-    """Rays of one held-out frame, and the depth at which a model ends each ray, [world units]."""
+    """Rays of one held-out frame, and the depth at which a model ends each ray. Lengths are in world units."""
 
     origins: FloatArray  # Shape (n, 3)
     directions: FloatArray  # Unit vectors, shape (n, 3)
@@ -292,15 +299,15 @@ class RenderedRays:
 def depth_metrics(
     frames: Iterable[RenderedRays], lattice: Lattice, world_to_input: FloatArray, scene: SyntheticScene
 ) -> dict[str, float]:
-    """Compare the depths at which rays end with those of the exact scene, ray by ray; return figures by name.
+    """Return errors, by name, of the depths at which a model ends rays, against the exact scene, ray by ray.
 
     `world_to_input` (4, 4) is the similarity from the lattice's world to input coordinates.
 
     Returns:
-        ``depth_error`` and ``depth_off_share``: of rays that meet the lattice's box and hit the true solid, the median
-        relative error of depth, and the share with an error above `DEPTH_TOLERANCE`. ``sky_filled``: of rays that truly
-        pass the solid and end outside the box, the share that the model ends inside it. Figures without rays are
-        left out.
+        ``depth_error`` and ``depth_off_share``: of all rays that meet the lattice's box and hit the true solid, the
+        median relative error of depth, and the share with an error above `DEPTH_TOLERANCE`. ``sky_filled``: of all rays
+        that miss the true solid and meet nothing else in the lattice's box, the share that the model ends in the box. A
+        figure without rays is left out.
     """
     transform = np.asarray(world_to_input, dtype=np.float64)
     scale = _scale_of(transform)
@@ -323,11 +330,15 @@ def depth_metrics(
 
 
 def mesh_errors(known: KnownTruth, mesh: TetMesh, tolerance_m: float, metres_per_unit: float = 1.0) -> dict[str, Any]:
-    """Return volume and area of a mesh, and distances and temperature errors at the true points seen, by name.
+    """Return volume and area of a mesh, and the errors of its surface and temperatures against the truth, by name.
 
-    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points of
-    the other facets; those from truth to mesh go from the true points to the nearest point of these facets. Without
-    such facets, or if all of them stand at surroundings, there are volume and area alone.
+    The surface consists of all facets that are not on the scene box, which cuts the scene. ``chamfer_m`` is half the
+    sum of two mean distances: from 20,000 random points of the surface that count (`KnownTruth.counts`) to the true
+    surface, and from `KnownTruth.points_seen` to their nearest points on the mesh's surface.
+    ``share_of_seen_reached`` is the share of the seen points that are within `tolerance_m` of the mesh's surface.
+    ``temperature_seen_mae_c`` is the mean absolute error [K] at the nearest points of the seen points so reached; None
+    if there are none, or no temperatures. Nodes are divided by `metres_per_unit`. If no point of the surface counts,
+    only ``mesh_volume_m3`` and ``mesh_area_m2`` are returned.
     """
     import pyvista as pv
     from trimesh.triangles import points_to_barycentric

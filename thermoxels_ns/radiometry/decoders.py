@@ -14,8 +14,7 @@ from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
 
-LARGEST_SIDE = 8192
-"""Largest side of a thermal image, [pixels]: four times that of the largest sensors and super-resolution (2048)."""
+LARGEST_SIDE = 8192  # largest side of a thermal image, [pixels]: four times that of the largest images (2048)
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _MAKE, _MODEL, _CHANGED_AT, _TAKEN_AT, _EXIF = 271, 272, 306, 36867, 34665
 
@@ -27,9 +26,9 @@ def errors_name(
     remedy: str = "The file is damaged; copy it from the camera again.",
     error: type[ThermoxelsError] = SceneError,
 ) -> Iterator[None]:
-    """Turn every exception in the `with` block into an `error` that names `path`; a `ThermoxelsError` passes unchanged.
+    """Turn any exception in the `with` block, except a `ThermoxelsError`, into an `error` that names `path`.
 
-    The message says what the file should be (`expected`) and what to do if the file is damaged (`remedy`).
+    The error's message says what the file should be (`expected`) and what to do if the file is damaged (`remedy`).
     """
     try:
         with warnings.catch_warnings():  # Pillow's warnings do not name the file; serious faults raise errors anyway
@@ -69,9 +68,9 @@ def check_not_empty(path: Path) -> None:
 
 
 def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
-    """Return name (APP1, APP3, ...) and content of a JPEG's application segments, where cameras store their data.
+    """Return the name (APP1, APP3, ...) and content of each application segment of a JPEG. Cameras store data in these.
 
-    With `whole` the picture is decoded too, so that a file that is cut off raises an error.
+    With `whole`, the picture is decoded too, so that a file that is cut off raises an error.
     """
     with Image.open(path, formats=("JPEG", "MPO")) as image:
         if whole:
@@ -80,9 +79,9 @@ def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
 
 
 def read_exif_facts(image: Image.Image) -> tuple[str | None, datetime | None]:
-    """Return maker and model in one text, and the time as the camera's clock showed it, from an opened image's EXIF.
+    """Return, from an opened image's EXIF, maker and model in one text, and the time that the camera's clock showed.
 
-    Each is None if its tags are missing. Pixels are not decoded.
+    Each of the two is None if its tags are missing. Pixels are not decoded.
     """
     exif = image.getexif()
     tags: Mapping[int, Any] = {**exif, **exif.get_ifd(_EXIF)}

@@ -38,7 +38,7 @@ class _Resolution(ctypes.Structure):
 
 
 class _Parameters(ctypes.Structure):
-    """Measurement parameters of `libdirp`, with spare room: newer libraries also write the air temperature."""
+    """Measurement parameters of `libdirp`, with spare room for fields that newer libraries add."""
 
     _fields_ = [
         ("distance_m", ctypes.c_float),
@@ -51,7 +51,7 @@ class _Parameters(ctypes.Structure):
 
 
 def is_dji_rjpeg(path: Path) -> bool:
-    """Return whether a JPEG names DJI and has APP3 segments with counts, which DJI's photographs do not have."""
+    """Return whether a JPEG names DJI and has APP3 segments. These hold counts; DJI's photographs have none."""
     segments = app_segments(path)
     made_by_dji = any(name == "APP1" and b"DJI" in content for name, content in segments)
     return made_by_dji and any(name == "APP3" for name, _ in segments)
@@ -60,9 +60,10 @@ def is_dji_rjpeg(path: Path) -> bool:
 def read_dji_rjpeg(path: Path, options: RadiometryOptions) -> tuple[Float32Array, Conditions]:
     """Return the temperatures (height, width) [degrees C] of a DJI R-JPEG, and the settings they were computed with.
 
-    How DJI's counts become degrees is not public. `libdirp` of DJI's Thermal SDK converts them; the SDK is free to
-    download but may not be passed on, so the user names the library. Raises `ThermalFileError` if the library is
-    missing, another one, or refuses the file or the settings, or if the file is cut off.
+    The settings are the file's, replaced by those that `options` state. DJI's conversion of counts is not public, so
+    `libdirp` of DJI's Thermal SDK converts them. The SDK is free to download but must not be passed on, so the user
+    names the library (`options.dji_library`). Raises `ThermalFileError` if the library is missing or is another one, if
+    it refuses the file or the settings, or if the file is cut off.
     """
     library = options.dji_library
     whole = "a whole DJI R-JPEG, as the drone wrote it"

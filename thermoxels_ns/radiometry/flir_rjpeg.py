@@ -1,4 +1,4 @@
-"""Reads FLIR's radiometric JPEG: the counts, calibration and settings stored beside the picture."""
+"""Reads FLIR's radiometric JPEG: the counts, calibration and settings that it stores beside the picture."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, app_segment
 from thermoxels_ns.radiometry.measurement_model import AirConstants, Conditions, PlanckConstants, RadiometricModel
 
 _RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
-"""Types of the records that are read; palettes, measuring tools, voice notes and others are ignored."""
+"""Types of the records that are read. All others, such as palettes, measuring tools and voice notes, are ignored."""
 _REMEDY = "Copy the file from the camera again; programs that edit pictures drop its thermal part."
 _FLIR_HEADER_BYTES, _IMAGE_HEADER_BYTES = 8, 32
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
-_HEAD_BYTES = 2**18  # so many first bytes are searched for a FLIR segment: EXIF segments of up to 64 KiB come first
+_HEAD_BYTES = 2**18  # number of first bytes that are searched for a FLIR segment, as EXIF (up to 64 KiB) precedes it
 _MOST_RECORDS = 1000
 
 
@@ -37,24 +37,25 @@ class _Record:
 
     @classmethod
     def marked(cls, content: bytes) -> _Record:
-        """Return the record with the byte order in which its first 16-bit number is 2."""
+        """Return a record of `content`. Its byte order is the one in which its first 16-bit number is 2."""
         return cls(content, "<" if content[:2] == b"\2\0" else ">")
 
     def numbers(self, offset: int, codes: str) -> tuple[float, ...]:
-        """Return the numbers at a byte offset, in the formats `codes` of `struct`."""
+        """Return the numbers that start at a byte offset; `codes` are their formats in the notation of `struct`."""
         return struct.unpack_from(self.order + codes, self.content, offset)
 
     def text(self, offset: int, length: int) -> str | None:
-        """Return the text at a byte offset, up to its first zero byte; None if empty."""
+        """Return the text at a byte offset, up to its first zero byte or to `length` bytes; None if it is empty."""
         raw = self.content[offset : offset + length].split(b"\0", 1)[0]
         return raw.decode("latin-1").strip() or None
 
 
 @dataclass(frozen=True)
 class PictureInPicture:
-    """Numbers by which a FLIR camera lays its thermal image over the photograph; good start values, no calibration.
+    """Factory alignment by which a FLIR camera lays its thermal image over the photograph.
 
-    The exact meaning of the numbers is not published, and the alignment is right at one distance only.
+    It gives good start values but is no calibration: the exact meaning of the numbers is not published, and the
+    alignment is right at one distance only.
     """
 
     real_to_thermal: float  # FLIR's Real2IR, the ratio of the two images' scales
@@ -85,7 +86,7 @@ class FlirImage:
     visible: bytes | None  # bytes of the photograph's JPEG or PNG; None if absent or in another format
 
     def temperature_c(self, conditions: Conditions | None = None) -> Float32Array:
-        """Return degrees C, (height, width), under `conditions` or else the camera's; NaN outside the calibration."""
+        """Return degrees C (height, width) under `conditions` (None: the camera's); NaN outside `camera.raw_range`."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
         low, high = self.camera.raw_range
         known = (self.counts >= low) & (self.counts <= high)
@@ -93,20 +94,18 @@ class FlirImage:
 
 
 def is_flir_jpeg(path: Path) -> bool:
-    """Return whether a file is a JPEG with FLIR's segments, by its first bytes."""
+    """Return whether the first bytes of a file show a JPEG with a FLIR segment."""
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     return head.startswith(JPEG_START) and _FIRST_SEGMENT.search(head) is not None
 
 
 def read_flir_jpeg(path: Path) -> FlirImage:
-    """Read counts, calibration, settings and photograph from a FLIR R-JPEG.
+    """Return the counts, calibration, settings and photograph of a FLIR R-JPEG.
 
-    This reader is our own because the library flyr is under the EUPL, a copyleft licence, and because only four kinds
-    of records are needed, whose layout is public.
-
-    Raises:
-        ThermalFileError: The file is cut off, a record is missing or damaged, or the image's size is impossible.
+    This reader is our own because the library flyr has a copyleft licence (EUPL), and because only four kinds of
+    records are needed, whose layouts are public. Raises `ThermalFileError` if the file is cut off, if a record is
+    missing or damaged, or if the image's size is impossible.
     """
     with errors_name(path, "a whole FLIR R-JPEG, as the camera wrote it", _REMEDY, ThermalFileError):
         parts: dict[int, bytes] = {}
@@ -131,10 +130,10 @@ def read_flir_jpeg(path: Path) -> FlirImage:
 
 
 def _records(fff: bytes) -> dict[int, bytes]:
-    """Return the content, by record type, of the records in an FFF block that this module reads.
+    """Return the bytes of the records that this module reads, by record type, from the FFF block of an R-JPEG.
 
-    An R-JPEG has one FFF block, split over its APP1 segments. Layout and field offsets are from ExifTool's public
-    tables of FLIR tags.
+    The caller must have joined the block from the APP1 segments. Layout and field offsets are from ExifTool's public
+    tables of FLIR tags. Raises `ValueError` if the block is damaged.
     """
     version = {order: struct.unpack_from(f"{order}I", fff, 20)[0] for order in "><"}
     order = next((order for order, number in version.items() if 100 <= number < 200), None)
@@ -153,10 +152,10 @@ def _records(fff: bytes) -> dict[int, bytes]:
 
 
 def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
-    """Return the raw counts, stored as plain numbers or as a PNG, shape (height, width).
+    """Return the raw counts (height, width) of a record that holds them as plain numbers or as a PNG.
 
     Most cameras write the PNG's 16-bit numbers in the wrong byte order, and no file states the order. A thermal image
-    is smooth but noise if its bytes are swapped; so the order with smaller differences between neighbours is right.
+    is smooth, and with swapped bytes it is noise: the order with the smaller differences between neighbours is taken.
     """
     record, data = _Record.marked(content), content[_IMAGE_HEADER_BYTES:]
     width, height = (int(number) for number in record.numbers(2, "HH"))
@@ -211,12 +210,12 @@ def _camera_info(record: _Record) -> CameraInfo:
 
 
 def _celsius(kelvin: float) -> float | None:
-    """Return a temperature in degrees C, or None for the 0 K that a camera writes for a setting it does not have."""
+    """Return a temperature in degrees C; None for 0 K, which a camera writes for a setting that it does not have."""
     return float(kelvin_to_celsius(kelvin)) if kelvin != 0.0 else None
 
 
 def _taken_at(record: _Record) -> datetime | None:
-    """Return the time of the shutter, with its time zone; None if the clock was never set or the record has no time."""
+    """Return the exposure's time with its time zone; None if the clock was never set or the record has no time."""
     try:
         seconds, milliseconds, zone = record.numbers(0x384, "IIh")
         east = timezone(timedelta(minutes=-int(zone)))
@@ -226,7 +225,7 @@ def _taken_at(record: _Record) -> datetime | None:
 
 
 def _picture_in_picture(content: bytes) -> PictureInPicture:
-    """Return the factory alignment; the byte order, which the record does not state, is that with a plausible scale."""
+    """Return the factory alignment. The record states no byte order: the one with a plausible scale is taken."""
     little, big = (_Record(content, order).numbers(0, "fhh") for order in "<>")
     scale, x, y = little if 0.01 < little[0] < 100.0 else big
     return PictureInPicture(scale, int(x), int(y))

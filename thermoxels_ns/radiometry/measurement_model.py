@@ -15,8 +15,7 @@ from thermoxels_ns.core.checks import check_positive, check_ranges
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
-DEFAULT_RELATIVE_HUMIDITY = 0.5
-"""Relative humidity that cameras assume, used if file and user state none; indoors its effect is below the noise."""
+DEFAULT_RELATIVE_HUMIDITY = 0.5  # as cameras assume, if file and user state none; indoors its effect is below noise
 _COLDEST_AIR_C, _HOTTEST_AIR_C = -100.0, 150.0
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
@@ -29,7 +28,7 @@ CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo",
 
 @dataclass(frozen=True)
 class Conditions:
-    """Settings that temperatures are computed with; the defaults (black body, no air) give apparent temperatures."""
+    """Conditions of a measurement. The defaults (black body, no air between) give apparent temperatures."""
 
     emissivity: float = 1.0
     """Emissivity of the objects in the picture, above 0, at most 1. Plaster, brick, wood, paint: 0.90 to 0.96."""
@@ -66,7 +65,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class RadiometryOptions:
-    """The user's settings for degrees C; None keeps what the file says. Contradictions raise `ThermoxelsError`."""
+    """The user's settings for degrees C; None: the file's. Raises `ThermoxelsError` if they contradict each other."""
 
     camera: CameraName | None = None
     """Camera whose counts TIFF or PNG files hold. Default: recognised from the file, which some files do not allow."""
@@ -101,7 +100,7 @@ class RadiometryOptions:
             raise ThermoxelsError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
 
     def applied_to(self, conditions: Conditions) -> Conditions:
-        """Return `conditions` with every field replaced that is not None here.
+        """Return `conditions`, with each field replaced by the field of that name in these options, unless it is None.
 
         >>> RadiometryOptions(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
         0.9
@@ -111,7 +110,7 @@ class RadiometryOptions:
 
 
 def conditions_text(conditions: Conditions) -> str:
-    """Return a text for the report about the conditions that temperatures were computed with.
+    """Return a text for the report that lists the conditions that temperatures were computed with.
 
     >>> conditions_text(Conditions(emissivity=0.95, reflected_c=20.0))
     'emissivity 0.95, reflected temperature 20 °C'
@@ -149,18 +148,18 @@ class PlanckConstants:
             raise ThermoxelsError("Planck constant O", expected="a finite number", got=self.o, remedy=_PLANCK_REMEDY)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Return the counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
+        """Return the sensor's counts for a black body, S = R1 / (R2 (exp(B / T) - F)) - O, in the shape of T, float64.
 
-        The temperatures T [K] must be above 0 and, if F is above 1, below B / ln F (thousands of kelvin).
+        The caller must pass temperatures T [K] above 0 and, if F is above 1, below B / ln F (thousands of kelvin).
         """
         temperature_k = np.asarray(temperature_k, dtype=np.float64)
         with np.errstate(divide="ignore", over="ignore"):  # near absolute zero only the offset remains
             return self.r1 / (self.r2 * (np.exp(self.b / temperature_k) - self.f)) - self.o
 
     def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Return a black body's temperature [K] for counts S, T = B / ln(R1 / (R2 (S + O)) + F), any shape, float64.
+        """Return a black body's temperature [K], B / ln(R1 / (R2 (S + O)) + F), in the shape of its counts S, float64.
 
-        The result is NaN where S + O is not above 0, because no temperature gives so small a signal.
+        The result is NaN for counts with S + O not above 0, because no temperature gives them.
         """
         radiance = np.asarray(signal, dtype=np.float64) + self.o
         radiance = np.where(radiance > 0, radiance, np.nan)
@@ -168,14 +167,14 @@ class PlanckConstants:
 
 
 LONG_WAVE = PlanckConstants(r1=1.0, r2=1.0, b=1450.0, f=1.0, o=0.0)
-"""Stands for microbolometers whose files hold degrees but no constants; only B and F matter to a correction. With
-emissivities from 0.9 on it corrects surfaces of -20 to 40 degrees C as Planck's law integrated from 7.5 to 13
-micrometres does, but for 0.04 K."""
+"""Constants for microbolometers whose files hold degrees but no constants; only B and F influence a correction. For
+emissivities from 0.9 on and surfaces of -20 to 40 degrees C, a correction with these constants differs by at most
+0.04 K from one with Planck's law integrated from 7.5 to 13 micrometres."""
 
 
 @dataclass(frozen=True)
 class AirConstants:
-    """Constants of the transmission of humid air, a sum of two parts; all FLIR files hold the default values."""
+    """Constants of `transmission`, which is a sum of two parts. All FLIR files hold the default values."""
 
     alpha1: float = 0.006569  # attenuation of the first part, [1/sqrt(m)]
     alpha2: float = 0.01262  # attenuation of the second part, [1/sqrt(m)]
@@ -189,11 +188,11 @@ class AirConstants:
             check_ranges("", {field.name: (getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")})
 
     def transmission(self, distance_m: float, air_c: float, relative_humidity: float) -> float:
-        """Return the share of the object's radiation that reaches the camera through air, 1 at distance 0 m.
+        """Return the transmission of humid air: the share of an object's radiation that reaches the camera, 0 to 1.
 
-        tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))) with the water
-        content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C, humidity 0 to 1
-        (Minkina and Dudzik 2009, section 2.3: the model of FLIR's cameras).
+        tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))), with distance d
+        [m] and water content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C,
+        humidity 0 to 1 (Minkina and Dudzik 2009, section 2.3: the model of FLIR's cameras).
 
         >>> AirConstants().transmission(0.0, 20.0, 0.5)
         1.0
@@ -211,14 +210,14 @@ class AirConstants:
 class RadiometricModel:
     """Relation between a sensor's signal and an object's temperature, for given air and conditions.
 
-    S(T) is the sensor's signal for a black body of temperature T (`sensor`). In front of a real object the sensor gives
-    (FLIR's measurement formula in its manuals; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
+    S(T) is the sensor's signal for a black body of temperature T (`sensor`). Its signal for a real object is (FLIR's
+    measurement formula in its manuals; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
 
         S_total = emissivity tau S(T_object) + (1 - emissivity) tau S(T_reflected) + (1 - tau) S(T_air)
 
-    with tau the transmission of the air. A window before the lens multiplies these terms by its transmission and adds
+    with the transmission tau of the air. A window before the lens multiplies these terms by its transmission and adds
     (1 - transmission) S(T_window). The weights add up to one, so a correction of temperatures does not depend on the
-    offset and scale of S: if a camera hides its constants, the shape of Planck's law in its band is enough.
+    offset and scale of S. If a camera hides its constants, the shape of Planck's law in its band is therefore enough.
     """
 
     conditions: Conditions
@@ -226,22 +225,22 @@ class RadiometricModel:
     air: AirConstants = AirConstants()
 
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
-        """Return the sensor's signal in front of objects of these temperatures [degrees C], any shape, float64."""
+        """Return S_total for objects of these temperatures [degrees C], in their shape, float64."""
         weight, background = self._weights()
         kelvin = celsius_to_kelvin(np.asarray(temperature_c, dtype=np.float64))
         return weight * self.sensor.signal(kelvin) + background
 
     def temperature_c(self, signal: npt.ArrayLike) -> Floats:
-        """Return the temperature [degrees C] of the objects that give this signal, any shape: the inverse of `signal`.
+        """Return the temperatures [degrees C] of objects with the total signals `signal`, in their shape, float64.
 
-        The result is NaN where reflections and air alone would give more than this signal.
+        The result is NaN for a signal that is not above what reflections and air alone give.
         """
         weight, background = self._weights()
         object_signal = (np.asarray(signal, dtype=np.float64) - background) / weight
         return kelvin_to_celsius(self.sensor.temperature_k(object_signal))
 
     def _weights(self) -> tuple[float, float]:
-        """Return the weight of the object's signal in the total, and the signal of reflections, air and window."""
+        """Return the weight of S(T_object) in S_total, which is refused if 0, and the sum of all other terms."""
         given = self.conditions
         air_c = 0.0 if given.air_c is None else given.air_c
         tau = self.air.transmission(given.distance_m, air_c, given.relative_humidity)
@@ -264,5 +263,5 @@ class RadiometricModel:
 
 
 def corrected_temperature_c(apparent_c: npt.ArrayLike, conditions: Conditions) -> Floats:
-    """Return the temperatures [degrees C] of objects from their apparent temperatures, any shape, float64."""
+    """Return temperatures [degrees C] from apparent ones, in their shape, for a `LONG_WAVE` sensor and `conditions`."""
     return RadiometricModel(conditions).temperature_c(RadiometricModel(Conditions()).signal(apparent_c))

@@ -1,4 +1,4 @@
-"""Finds the format of thermal files by their content, reads pixels of a known unit as degrees C, finds stuck pixels."""
+"""Finds the format of thermal files, reads files of a known unit as degrees C, and finds stuck pixels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
 ThermalFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "JPEG", "TIFF", "PNG", "NPY", "CSV"]
 THERMAL_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".csv")
-"""Suffixes of thermal files and photographs; other files of a folder (videos, logs) are passed over."""
+"""Suffixes of thermal files and photographs. Other files of a folder (videos, logs) are ignored."""
 _HEAD_BYTES = 4096
 _STARTS: dict[bytes, ThermalFormat] = {
     b"II*\0": "TIFF",
@@ -42,7 +42,7 @@ _NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none"
 _TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
 _FLOATING = 3  # value of TIFF's sample format for floating-point numbers
-VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range count as no measurements, [degrees C]
+VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range are masked, [degrees C]
 MIN_FRAMES = 5  # with fewer frames, no pixel counts as stuck
 _WINDOW = 2  # half width of a neighbourhood of 5 x 5 pixels, in which a dead column or row is a minority
 _EXPECTED = "a readable thermal file"
@@ -61,10 +61,10 @@ _COUNTS_REMEDY = (
 
 @dataclass(frozen=True)
 class ThermalUnit:
-    """Conversion of a thermal file's numbers, by default degrees Celsius, made by `bounds` or `linear` if others."""
+    """Conversion of a thermal file's numbers to degrees Celsius, made by `bounds` or `linear`; by default, none."""
 
     kind: Literal["bounds", "linear", "celsius"] = "celsius"
-    """bounds: counts span min to max; linear: counts times a factor plus an offset; celsius: no conversion."""
+    """bounds: count 0 to highest count span min to max; linear: count * scale + offset; celsius: no conversion."""
     scale: float = 1.0  # bounds: max minus min, [K]; linear: [K per count]
     offset_c: float = 0.0  # temperature of count zero, [degrees Celsius]
 
@@ -87,7 +87,7 @@ class ThermalUnit:
 
 
 def detect_format(path: Path) -> ThermalFormat:
-    """Return the format of a file by its content; raise `ThermalFileError` if it is missing, empty or of no format."""
+    """Return a file's format, by its content; raise `ThermalFileError` if it is missing, empty or of unknown format."""
     if not path.is_file():
         remedy = "Check the path; in a scene, restore the file, remove its frame or pass --missing-thermal skip."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
@@ -107,16 +107,13 @@ def detect_format(path: Path) -> ThermalFormat:
 
 
 def read_thermal_file(path: Path, unit: ThermalUnit) -> Float32Array:
-    """Return the temperatures (height, width) [degrees C] of a file whose `unit` is known, NaN where not measured.
+    """Return the temperatures (height, width) [degrees C] of a file whose `unit` is known, NaN in masked pixels.
 
-    The content tells the format, not the name.
-
-    A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
-    bounds or linear for PNG and JPEG, linear for TIFF and NPY. A floating-point TIFF is in degrees Celsius unless the
-    unit is linear; CSV and floating-point NPY are always in degrees Celsius.
-
-    Raises:
-        ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
+    The content, not the name, decides the format. A FLIR R-JPEG is converted by the calibration and settings in the
+    file, without `unit`. Counts need a unit: bounds or linear for PNG and JPEG, linear for TIFF and NPY. A
+    floating-point TIFF is in degrees Celsius unless the unit is linear; CSV and floating-point NPY are always in
+    degrees Celsius. With a linear unit, the lowest and highest possible counts are masked as saturated. Raises
+    `ThermalFileError` if the file is missing, damaged or a colour picture, or if its counts have no unit.
     """
     values: npt.NDArray[Any]
     no_data = None
@@ -159,7 +156,7 @@ def read_thermal_file(path: Path, unit: ThermalUnit) -> Float32Array:
 
 
 def masked_image(temperature_c: npt.NDArray[np.floating]) -> Float32Array:
-    """Return temperatures (height, width) [degrees C], NaN where not finite or outside `VALID_RANGE_C`."""
+    """Return a copy of temperatures (height, width) [degrees C] with NaN for all that are outside `VALID_RANGE_C`."""
     with np.errstate(invalid="ignore"):
         good = (temperature_c >= VALID_RANGE_C[0]) & (temperature_c <= VALID_RANGE_C[1])
     return np.where(good, temperature_c, np.nan).astype(np.float32)
@@ -179,7 +176,7 @@ def _read_npy(path: Path) -> npt.NDArray[Any]:
 
 
 def _read_csv(path: Path) -> FloatArray:
-    """Return a table of numbers, split by commas or semicolons; empty cells and nan, NA, null, none, - are NaN."""
+    """Return a table of numbers, split by commas or semicolons. Empty cells and nan, NA, null, none, - are NaN."""
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -201,7 +198,7 @@ def _number(cell: str) -> float:
 
 
 def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
-    """Return the counts of a grey picture (height, width), and a mask of its transparent pixels (None: no alpha)."""
+    """Return the numbers (height, width) of a grey picture, and a mask of its transparent pixels (None: no alpha)."""
     pixels = None
     size = size_of_double_tiff(path)  # Pillow cannot open a TIFF of 64-bit numbers
     if size is not None:
@@ -257,10 +254,10 @@ def _damaged(path: Path, problem: object) -> ThermalFileError:
 def find_dead_pixels(stack: Float32Array) -> BoolArray:
     """Return a mask (height, width) of pixels that are stuck at one value, from temperatures (frames, height, width).
 
-    A constant value alone is no proof: live pixels are constant too where the image border always shows the same cold
-    sky, or in a scene of one temperature. A pixel is stuck if three things hold: the pixel has the same finite value in
-    all frames; fewer than half of all pixels are constant; and the median of the 5 x 5 pixels around the pixel differs
-    from its value in at least half of the frames. With fewer than 5 frames, no pixel counts as stuck.
+    A pixel is stuck if it has the same finite value in all frames, fewer than half of all pixels are constant in this
+    way, and the median of the 5 x 5 pixels around it differs from its value in at least half of the frames. A constant
+    value alone is no proof: live pixels are constant too in a scene of one temperature, or at an image border that
+    always shows the same cold sky. With fewer than 5 frames, no pixel counts as stuck.
     """
     frames, height, width = stack.shape
     dead = np.zeros((height, width), dtype=bool)

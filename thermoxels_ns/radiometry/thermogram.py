@@ -1,4 +1,4 @@
-"""Reads any thermal camera file, recognised by its content, as degrees C and metadata."""
+"""Reads thermal camera files of all known formats as degrees C and metadata. The content shows the format."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
     "flir-duo": (ThermalUnit.linear(0.01, -273.15), "FLIR Duo R (the first one)"),
     "sensefly": (ThermalUnit.linear(0.01, -100.0), "senseFly thermoMAP and Duet T"),
 }
-"""Unit of the counts and names of the cameras, by preset, from the makers' manuals. A file does not state which of
-FLIR's two gains was used, so the user must say."""
+"""Unit of the counts, and names of the cameras, by preset, from the makers' manuals. The user must choose between
+FLIR's two gains, because files do not state which was used."""
 
 
 def recognised_camera(camera: str | None) -> CameraName | None:
-    """Return the preset (`COUNT_SCALES`) that maker and model in a file determine; None if the user must choose.
+    """Return the preset (`COUNT_SCALES`) of the maker and model that a file states; None: the user must choose.
 
     >>> recognised_camera("Workswell s.r.o. WIRIS Pro"), recognised_camera("FLIR Duo Pro R")
     ('workswell', None)
@@ -52,14 +52,14 @@ def recognised_camera(camera: str | None) -> CameraName | None:
 
 @dataclass(frozen=True)
 class ThermogramMetadata:
-    """What a thermal file states besides its temperatures; a field is None if the file does not state it."""
+    """Metadata of a thermal file. A field is None if the file does not state it."""
 
     format: ThermalFormat  # detected from the content, not from the name
     camera: str | None = None  # maker and model
     field_of_view_deg: float | None = None
     """Horizontal angle of view of the thermal lens as the camera states it; some state nonsense such as 180."""
     conditions: Conditions | None = None
-    """Conditions that the temperatures were computed with: the camera's, or the user's where these were given."""
+    """Conditions that the temperatures were computed with: the camera's, replaced by those that the user gave."""
     picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
     celsius_per_count: float | None = None  # temperature step of one count, [K]; None if counts are not linear in it
 
@@ -75,19 +75,17 @@ class Thermogram:
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
     """Return the temperatures and metadata of a thermal camera file. The format decides how degrees C are computed:
 
-    | format | degrees from |
+    | format | source of degrees C |
     |---|---|
     | FLIR R-JPEG | the counts and the Planck constants in the file |
     | DJI R-JPEG | DJI's own library, where the user has it |
     | TIFF, 16-bit PNG | a camera preset or the user's scale; floats are degrees C |
     | NPY, CSV | degrees C; whole numbers in NPY need a scale |
 
-    A picture (palette JPEG, 8-bit PNG) is refused, because its colours cannot be turned back into temperatures.
-
-    Raises:
-        ThermalFileError: The file is missing, empty, damaged, absurdly large, a picture without temperatures or of an
-            unknown format, or its counts have no known unit.
-        ThermoxelsError: The options contradict the file's conditions, e.g. an emissivity below 1 without reflected_c.
+    Raises `ThermalFileError` if the file is missing, empty, damaged, absurdly large or of an unknown format, if its
+    counts have no known unit, or if it is a picture (palette JPEG, 8-bit PNG), whose colours cannot be turned back into
+    temperatures. Raises `ThermoxelsError` if the options contradict the file's conditions, for example an emissivity
+    below 1 without reflected_c.
     """
     options = options or RadiometryOptions()
     with errors_name(path, "a whole and readable thermal file", error=ThermalFileError):
@@ -116,7 +114,10 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
 def _read_stored(
     path: Path, found: ThermalFormat, options: RadiometryOptions
 ) -> tuple[Float32Array, ThermogramMetadata]:
-    """Read a file of apparent temperatures or of counts linear in temperature; correct for the user's conditions."""
+    """Return temperatures [degrees C] and metadata of a file of apparent temperatures, or of counts linear in them.
+
+    `found` is the file's format. Temperatures are corrected for the conditions in `options`.
+    """
     camera, picture = None, found in ("TIFF", "PNG")
     unit = None if options.camera is None else COUNT_SCALES[options.camera][0]
     if options.celsius_per_count is not None and options.celsius_offset is not None:

@@ -39,7 +39,7 @@ class SolidTexture:
             self._octaves.append((spacing * voxel, amplitude, size, values))
 
     def __call__(self, points: npt.ArrayLike) -> Float32Array:
-        """Return the deviation of red, green and blue at points (n, 3) [m], (n, 3): about 0, mostly within -1 to 1."""
+        """Return the deviations of red, green and blue (n, 3) at points (n, 3) [m]: mean about 0, mostly in -1 to 1."""
         relative = np.asarray(points, dtype=np.float64) - self._lo
         noise = np.zeros((len(relative), 3), dtype=np.float32)
         for spacing, amplitude, size, values in self._octaves:
@@ -91,8 +91,8 @@ def painted(
 ) -> Float32Array:
     """Return the colour of surface points, (n, 3) in [0, 1]: base colour plus texture, times the brightness.
 
-    Points [m] and unit normals have shape (n, 3); `part` (n,) has the index into `paints` of each point. Mirrors are
-    left to `raycast`.
+    Points [m] and unit normals have shape (n, 3); `part` (n,) is the index of each point's paint in `paints`. The
+    brightness is that of `light`. The share that the paint mirrors is ignored here.
     """
     base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*((p.base, p.contrast) for p in paints)))
     colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
@@ -102,7 +102,8 @@ def painted(
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
     """Return the apparent temperature [C] of sky and far ground along unit directions (n, 3), shape (n,).
 
-    It is `horizon_c` at the horizon, `drop_k` less at the zenith, 2 K more straight below, and linear in z between.
+    The temperature is `horizon_c` at the horizon, `drop_k` lower at the zenith, and 2 K higher straight below. Between
+    these it is linear in z, the sine of the elevation.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)

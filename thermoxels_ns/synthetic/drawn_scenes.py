@@ -206,7 +206,7 @@ def house_corner(white: bool = False) -> SyntheticScene:
 
 
 def true_u_w_m2k(points: npt.ArrayLike) -> FloatArray:
-    """Return the U-value [W/(m2 K)] of the house's walls and panes, (n,), which sets their warmth, at points (n, 3)."""
+    """Return the U-value [W/(m2 K)] (n,) that gives the house's walls and panes their temperature at points (n, 3)."""
     return (house_corner().surface_temperature_c(points) - _HOUSE_AIR_C) / _KELVIN_PER_U
 
 
@@ -296,7 +296,7 @@ def courtyard() -> SyntheticScene:
 
 
 def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float = 0.0) -> Plan:
-    """Return a plan in metres from (paint, shapes ...) for each paint, and openings with panes `recess_m` deep."""
+    """Return a plan in metres with shapes `painted`, (paint, shape ...), and openings with panes `recess_m` deep."""
     plan = Plan(np.random.default_rng(0), unit=_PANE_M)
     for paint, *shapes in painted:
         number = plan.add_paint(paint)
@@ -308,7 +308,7 @@ def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float =
 
 
 def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
-    """Return a scene of a plan, by default in a room at the lower of its `temperature_bounds_c`."""
+    """Return a scene of a plan. By default, its background is a room at the lower of its `temperature_bounds_c`."""
     room = {
         "background_rgb": room_rgb,
         "background_temperature_c": everywhere(fields["temperature_bounds_c"][0]),
@@ -317,7 +317,7 @@ def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> Sy
 
 
 def _of_nearest(points: npt.ArrayLike, *bodies: tuple[Any, ...]) -> FloatArray:
-    """Return the temperatures (n,) of the body nearest to each point (n, 3); a body is temperatures (n,) and shapes."""
+    """Return the temperature (n,) of the body nearest to each point (n, 3). A body is temperatures (n,) and shapes."""
     far = [np.min([distance_to(shape, points) for shape in shapes], axis=0) for _, *shapes in bodies]
     return np.choose(np.argmin(far, axis=0), [degrees for degrees, *_ in bodies])
 
@@ -372,7 +372,7 @@ def wall_object() -> SyntheticScene:
 def living_room() -> SyntheticScene:
     """Build a furnished room of 5.2 x 4.2 x 2.7 m, photographed from inside, with white walls and a plain ceiling.
 
-    Walls are 17 to 19 C, colder in the corners of the outer wall, whose window has 12 C and whose radiator has 45 C.
+    Walls are 17 to 19 C, and colder in the corners of the outer wall. Its window has 12 C and its radiator 45 C.
     """
     x, y, high, thick = 2.6, 2.1, 2.7, 0.25
     radiator: Box = ((x - 0.12, -1.0, 0.12), (x, 0.6, 0.75))
@@ -429,14 +429,17 @@ def facade() -> SyntheticScene:
 def street() -> SyntheticScene:
     """Build a front of plain plaster with mirroring panes and a balcony with a railing of 2 cm bars, in a street.
 
-    Textured houses stand all round: also behind the cameras, where the panes mirror them.
+    Textured houses stand all round. The panes mirror the houses behind the cameras.
     """
     scene = _front("street", Paint((0.80, 0.76, 0.68), 0.0), mirror=0.6, sky=None, railing=True)
     return with_street(scene, seed=1)
 
 
 def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
-    """Return a scene of a front, 10.4 m wide and 7.6 m high, past which three lines of cameras lead."""
+    """Return a scene of a house front, 10.4 m wide and 7.6 m high, with three lines of cameras along it.
+
+    `mirror` is the panes' share of mirrored light; `sky` is one colour, None: a blue sky; `railing`: add a balcony.
+    """
     plan = Plan(np.random.default_rng(8))
     paints = (
         wall,
@@ -480,7 +483,7 @@ def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: b
 
 
 def _balcony(plan: Plan, stone: int, metal: int) -> None:
-    """Put a slab over the door with bars 2 cm thick, 12 cm apart, and a rail on top into a plan in decimetres."""
+    """Add a balcony over the door to a plan in decimetres: a slab, bars (2 cm thick, 12 cm apart), a rail on top."""
     x, out, low, top, thick = 18.0, 13.0, 39.0, 50.0, 0.2
     plan.put(((-x, -out, low - 3.0), (x, 0.0, low)), stone, 0.3)
     across, along = np.arange(-x + 0.2, x - 0.2, 1.2).tolist(), np.arange(-out + 1.4, -1.0, 1.2).tolist()

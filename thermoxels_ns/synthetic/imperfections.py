@@ -30,7 +30,7 @@ class Imperfections:
     """Quality of JPEG files, 1 to 95."""
     pose_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which given poses are turned, [degrees]. Given positions are
-    also moved, along each axis by such an angle in radians times the distance to the scene's middle."""
+    also moved: along each axis by a second such angle, in radians, times the distance to the scene's middle."""
     pose_correlation: float = 0.0
     """Correlation of the pose errors of successive photographs, below 1: 0.95 for a walk."""
     focal_error: float = 0.0
@@ -80,13 +80,13 @@ class DrawnFlaws:
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
     def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
-        """Return standard normal numbers of a stream, for one photograph or without `number` for all."""
+        """Return standard normal numbers of the given shape from a stream of its own for each `stream` and `number`."""
         return np.random.default_rng(
             [self._seed, stream] if number is None else [self._seed, stream, number]
         ).standard_normal(shape)
 
     def given_poses(self) -> FloatArray:
-        """Return the wrong poses (n, 4, 4) that a scene folder contains in place of the true poses."""
+        """Return the true poses with the drawn errors, (n, 4, 4), camera to world: the scene folder states these."""
         from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
 
         given = self._poses.copy()
@@ -95,18 +95,18 @@ class DrawnFlaws:
         return given
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
-        """Return the lowest and highest reading of thermal images of a scene of `lowest_c` to `highest_c`, [C]."""
+        """Return the lowest and highest reading [C] that drift and noise make of `lowest_c` and `highest_c` [C]."""
         margin = _NOISE_SIGMAS * self.flaws.noise_k
         low, high = min(float(self.drifts_k.min()), 0.0), max(float(self.drifts_k.max()), 0.0)
         return lowest_c + (low - margin), highest_c + (high + margin)
 
     def given_camera(self, camera: Camera) -> Camera:
-        """Return the wrong intrinsics that a scene folder contains in place of those of `camera`."""
+        """Return `camera` with the error of its focal length: the scene folder states this camera."""
         stretch = 1.0 + self.flaws.focal_error
         return replace(camera, fl_x=stretch * camera.fl_x, fl_y=stretch * camera.fl_y)
 
     def photograph(self, number: int, rgb: Float32Array) -> npt.NDArray[np.uint8]:
-        """Return photograph `number`, counts (h, w, 3), taken where a flawless camera sees colours `rgb`, 0 to 1."""
+        """Return photograph `number` with its flaws, counts (h, w, 3), of the true colours `rgb` (h, w, 3), 0 to 1."""
         flaws, draw = self.flaws, np.random.default_rng([self._seed, 7, number])
         place, seen = draw.random(3)[2], rgb.astype(np.float64)
         if self._passing[number]:
@@ -115,7 +115,7 @@ class DrawnFlaws:
         return np.clip(np.round(counts), 0, 255).astype(np.uint8)
 
     def thermogram(self, number: int, temperature_c: FloatArray) -> FloatArray:
-        """Return the readings (h, w) of thermal image `number` where a flawless camera reads `temperature_c`."""
+        """Return thermal image `number` with its flaws, (h, w) [C], made from the true `temperature_c` (h, w) [C]."""
         from scipy import ndimage
 
         flaws, shape, seen = self.flaws, temperature_c.shape, temperature_c.copy()
@@ -138,7 +138,7 @@ class DrawnFlaws:
 
 
 def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
-    """Return the pixels (h, w) that a passer-by covers: an upright ellipse at a share `place` of the width."""
+    """Return a mask (h, w) of the pixels that a passer-by covers, an ellipse `place` times the width from the left."""
     height, width = shape
     rows, columns = np.mgrid[:height, :width] + 0.5
     x, y = (columns - place * width) / height, (rows - 0.6 * height) / height

@@ -16,7 +16,7 @@ _AISLE = 4.0  # half of the least gap between machines
 
 
 def detached_house(plan: Plan) -> None:
-    """Put a house on a plinth with a stepped roof and windows into a plan, with an annex on one of its sides."""
+    """Add a house to a plan: on a plinth, with a stepped roof, windows, and an annex on one of its sides."""
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(104, WIDEST), u(94, 112)
@@ -58,7 +58,7 @@ def detached_house(plan: Plan) -> None:
 
 
 def wings(plan: Plan) -> None:
-    """Put an L or a U of flat-roofed wings with a balcony, a jutting storey and a thin garden wall into a plan."""
+    """Add an L or a U of flat-roofed wings, with a balcony, a jutting storey and a thin garden wall, to a plan."""
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(106, WIDEST), u(102, WIDEST)
@@ -127,7 +127,7 @@ def wings(plan: Plan) -> None:
 
 
 def facade(plan: Plan) -> None:
-    """Put a facade with window recesses, sills and a cornice into a plan, a post before it and perhaps steps."""
+    """Add a facade with window recesses, sills and a cornice, a post before it, and perhaps steps, to a plan."""
     u = plan.u
     ground, wall, stone, glass = (plan.paint(m) for m in ("ground", "wall", "stone", "glass"))
     half_x, ground_half = 0.5 * u(84, 104), 0.5 * u(108, WIDEST)
@@ -159,7 +159,7 @@ def facade(plan: Plan) -> None:
 
 
 def railing(plan: Plan) -> None:
-    """Put thin bars under a rail along the front edge of the ground, the first of `plan.pieces`."""
+    """Add thin bars under a rail along the front edge of the ground. The ground must be `plan.pieces[0]`, a box."""
     u = plan.u
     ground = plan.pieces[0].shape
     assert isinstance(ground, tuple)
@@ -174,7 +174,7 @@ def railing(plan: Plan) -> None:
 
 
 def _stepped_roof(plan: Plan, body: Box, paint: int) -> Box:
-    """Put eaves and a roof of steps that shrink to a ridge along x onto `body`, and return the last step."""
+    """Add eaves and a stepped roof, whose steps shrink to a ridge along x, on top of `body`; return the last step."""
     u = plan.u
     (x0, y0, _), (x1, y1, z) = body
     over, steps, warm = u(3.3, 5.5), int(plan.draw.integers(2, 5)), u(0.0, 0.25)
@@ -199,7 +199,11 @@ def _windows(
     rows: int | None = None,
     pier: float = _PIER,
 ) -> list[tuple[Range, Range]]:
-    """Cut a grid of openings of equal size into a wall, leave some out, and return the extents of each opening."""
+    """Cut a grid of equal openings with panes into a wall, except for some at random; return each opening's extents.
+
+    The openings lie within `along` (less `_CORNER` at both ends) and `height`; extents are along the wall and in z.
+    `columns` and `rows` of the grid follow from the wall's size if None. `pier` is the least wall beside an opening.
+    """
     a0, a1 = along[0] + _CORNER, along[1] - _CORNER
     z0, z1 = height
     room = 2.0 * pier + _OPENING
@@ -225,14 +229,14 @@ def _windows(
 
 
 def _spots(plan: Plan, boxes: tuple[Box, ...], high: float) -> None:
-    """Add one to three warm spots, such as vents and leaks, on random boxes, and a cold spot on the first box."""
+    """Add one to three warm spots on random boxes, and a cold spot on the first; their reach is a share of `high`."""
     for _ in range(int(plan.draw.integers(1, 4))):
         plan.spot(boxes[int(plan.draw.integers(len(boxes)))], plan.u(0.7, 1.1), plan.u(0.15, 0.4) * high)
     plan.spot(boxes[0], plan.u(0.1, 0.2), plan.u(0.2, 0.5) * high)
 
 
 def _put_ground(plan: Plan, size_x: float, size_y: float, thickest: float, paint: int | None, warmest: float) -> None:
-    """Put a slab below z = 0 that is between 4 and `thickest` voxels thick; `paint` None: draw a paint."""
+    """Add a slab below z = 0, 4 to `thickest` voxels thick and of warmth 0 to `warmest`; `paint` None: a random one."""
     half_x, half_y, thick = 0.5 * size_x, 0.5 * size_y, plan.u(4, thickest)
     paint = plan.paint("ground") if paint is None else paint
     plan.put(((-half_x, -half_y, -thick), (half_x, half_y, 0.0)), paint, plan.u(0.0, warmest))
@@ -250,7 +254,7 @@ def _against(wall: Wall, out: float, along: Range, height: Range) -> Box:
 
 
 def machinery(plan: Plan) -> None:
-    """Put tanks, drums, balls, blocks and frames on a floor slab, at least one of each, into a plan."""
+    """Add a floor slab with a tank, a drum, a ball, a block, a frame, and mostly a second one of these, to a plan."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(84, 108)
     _put_ground(plan, size_x, size_y, 6, None, 0.2)
@@ -266,7 +270,7 @@ def machinery(plan: Plan) -> None:
 
 
 def pipes_and_radiators(plan: Plan) -> None:
-    """Put a wall on a floor into a plan, with radiators on one or both sides, standing pipes, and pipes on posts."""
+    """Add a wall on a floor to a plan, with a radiator on one side or both, upright pipes, and level pipes on posts."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(86, 100)
     _put_ground(plan, size_x, size_y, 6, None, 0.15)
@@ -296,7 +300,7 @@ def pipes_and_radiators(plan: Plan) -> None:
 
 
 def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
-    """Put a radiator (a panel, or columns between rails) before a wall, and return how far it reaches from the wall."""
+    """Add a radiator (panel, or columns between rails) before the wall face y = `sign` * `plane`; return its reach."""
     u = plan.u
     gap, thick, low, tall = u(4, 6), u(4, 6), u(6, 12), u(20, 28)
     paint, warm = plan.paint("metal"), u(0.75, 1.0)
@@ -321,7 +325,10 @@ def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
 
 
 def _lying_pipe(plan: Plan, sign: int, near: float, half: float, high: float) -> None:
-    """Put a level pipe on two posts along the wall, with its near side at distance `near` from the wall's middle."""
+    """Add a level pipe on two posts along a wall of half length `half` and height `high`, on its side `sign` (1: +y).
+
+    The pipe's near side has the distance `near` from the wall's middle plane.
+    """
     u = plan.u
     radius, length, z = u(2.2, 5), u(1.1, 1.8) * half, u(0.25, 0.8) * high
     x, y = u(-1, 1) * (half - 0.5 * length), sign * (near + radius)

@@ -28,7 +28,7 @@ Range = tuple[float, float]
 Wall = tuple[int, int, float]
 """A wall: the axis of its normal (0 or 1), the sign of its outward normal, and the coordinate of its plane."""
 
-SMALLEST = 3.1  # lower bound of thicknesses, gaps and steps of a random plan, but for railings [voxels of the plan]
+SMALLEST = 3.1  # lower bound of thicknesses, gaps and steps of a random plan, except railings [voxels of the plan]
 WIDEST = 116.0  # upper bound of a plan's extent [voxels of the plan]; with the margins of the scene box below 127
 HAIR = 0.002
 """Gap between a cylinder and what carries it [voxels of the plan], since parts of `SolidUnion` must share no face."""
@@ -53,15 +53,15 @@ class Piece:
     shape: Shape
     paint: int  # index into `Plan.paints`
     warmth: float  # warmth at the middle of the shape, from about 0 (coldest of the scene) to 1 (hottest)
-    slope: FloatArray  # change of the warmth along x, y and z, (3,) [per unit of length]
+    slope: FloatArray  # gradient of the warmth, (3,) [per unit of length]
 
 
 @dataclass(frozen=True, eq=False)
 class Glow:
-    """A box, or a point, of one warmth that fades into the warmth around it."""
+    """A box or a point with a warmth of its own. Around the box, this warmth fades into that of the pieces."""
 
     core: Box  # box that has the full warmth; a point if both corners agree
-    warmth: float  # as of `Piece`
+    warmth: float  # warmth of the core, on the scale of `Piece.warmth`
     reach: float  # distance from the core beyond which the glow changes nothing [units of length]
 
 
@@ -72,7 +72,7 @@ class Plan:
     draw: np.random.Generator  # source of all random choices
     pieces: list[Piece] = field(default_factory=list)
     """Pieces in the order in which they were put; boxes may overlap and touch, round pieces must not."""
-    removed: list[Box] = field(default_factory=list)  # boxes that are cut out of all other boxes
+    removed: list[Box] = field(default_factory=list)  # boxes that are cut out of all box-shaped pieces
     glows: list[Glow] = field(default_factory=list)  # places that are warmer, or colder, than the piece around them
     paints: list[Paint] = field(default_factory=list)
     unit: float = 1.0  # length of a voxel of the plan, which is also the thickness of panes [unit of the plan]
@@ -88,7 +88,7 @@ class Plan:
         return bool(self.draw.random() < share)
 
     def paint(self, material: str) -> int:
-        """Draw a paint of a material (random base colour, shade and contrast), add it, and return its index."""
+        """Add a paint of a material (a key of `_BASES`), drawn at random, to the plan; return its index in `paints`."""
         base = np.asarray(_BASES[material][int(self.draw.integers(len(_BASES[material])))])
         mixed = np.clip(base + self.u(-_SHADE, _SHADE) + self.draw.uniform(-0.03, 0.03, 3), 0.12, 0.85)
         red, green, blue = mixed.tolist()
@@ -103,15 +103,20 @@ class Plan:
         return len(self.paints) - 1
 
     def put(self, shape: Shape, paint: int, warmth: float = 0.0) -> None:
-        """Add a `Piece` with this shape, paint (index) and warmth, and with a gentle random slope."""
+        """Add a `Piece` to the plan. `paint` is an index into `paints`; `warmth` is the warmth at the shape's middle.
+
+        The slope, which is the gradient of the warmth, is drawn at random: each component is uniform from -s to s, with
+        s = 0.12 / the longest side of the shape's bounds (at least 1).
+        """
         lo, hi = bounds_of(shape)
         slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
         self.pieces.append(Piece(shape, paint, warmth, slope))
 
     def recess(self, wall: Wall, along: Range, height: Range, depth: float, paint: int, warmth: float) -> None:
-        """Cut an opening, with extents along a wall and in z, and put a pane `depth` behind the wall's plane into it.
+        """Cut an opening into a wall, and put a pane, `unit` thick, into it, `depth` behind the wall's plane.
 
-        The pane's warmth fades into the wall within the distance `depth`.
+        `along` and `height` are the opening's extents along the wall and in z; `paint` is an index into `paints`. A
+        `Glow` lets the pane's `warmth` fade into the wall within the distance `depth`.
         """
         axis, sign, plane = wall
         back = plane - sign * depth
@@ -130,7 +135,7 @@ class Plan:
         self.glows.append(Glow(box_between(point, point), warmth, reach))
 
     def scaled(self, factor: float) -> Plan:
-        """Return a plan with all lengths times `factor`, which shares `draw` and `paints` with this plan."""
+        """Return a copy of this plan with all lengths times `factor`. Copy and plan share `draw` and `paints`."""
 
         def scale(shape: Any) -> Any:
             if isinstance(shape, tuple):
@@ -147,14 +152,17 @@ class Plan:
         )
 
     def solid(self) -> Solid:
-        """Return the exact solid: all boxes joined, the openings cut out of these, and the round pieces beside."""
+        """Return the exact solid: the union of all box-shaped pieces minus the openings, and of the round pieces."""
         boxes = [piece.shape for piece in self.pieces if isinstance(piece.shape, tuple)]
         parts: list[Solid] = [BoxSolid(boxes, self.removed)] if boxes else []
         parts += [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
         return parts[0] if len(parts) == 1 else SolidUnion(tuple(parts))
 
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
-        """Return the paint index (n,) of the last piece that contains each surface point (n, 3); normals: (n, 3)."""
+        """Return, for each surface point (n, 3), the paint index of the last piece that contains it, (n,); none: 0.
+
+        Each point is first moved inwards by 0.01 `unit`, against its outward unit normal (n, 3).
+        """
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
         x, y, z = np.ascontiguousarray(inner.T)
@@ -168,10 +176,10 @@ class Plan:
         return number
 
     def warmth(self, points: npt.ArrayLike) -> FloatArray:
-        """Return the warmth at points (n, 3), continuous in space, shape (n,).
+        """Return the warmth at points (n, 3), shape (n,). It is continuous in space.
 
-        Warmth is the mean of that of all pieces, weighted by exp(-distance / 2 voxels), so that touching pieces blend
-        as by heat conduction; then glows are blended in.
+        It is the weighted mean of the pieces' warmths, with the weights exp(-distance / 2 `unit`): touching pieces
+        blend as by heat conduction. Glows are then blended in.
         """
         points = np.asarray(points, dtype=np.float64)
         far = np.array([distance_to(piece.shape, points) for piece in self.pieces])
@@ -182,7 +190,7 @@ class Plan:
         return warmth
 
     def add_glows(self, values: FloatArray, points: FloatArray) -> None:
-        """Blend the glows into values of warmth, or of temperature, (n,) at points (n, 3), in place."""
+        """Change `values` (n,), the warmth or temperature at `points` (n, 3), in place: blend the glows into them."""
         for glow in self.glows:
             near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
             values += (glow.warmth - values) * near * near * (3.0 - 2.0 * near)

@@ -79,8 +79,9 @@ def random_seed(name: str) -> int | None:
 def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     """Return the scene of a seed, named ``random-`` or ``wild-`` and the seed; the same seed gives the same scene.
 
-    Random scenes have textured walls and a background of smooth gradients. Some wild scenes have plain walls, mirroring
-    panes or a thin railing; a third each has smooth gradients, one plain colour, or a street or room behind it.
+    Random scenes have textured walls and a background of smooth gradients. With `wild`, some scenes have plain walls,
+    mirroring panes or a thin railing. Their background is, by `seed` modulo 3: smooth gradients (0), one plain colour
+    (1), or a street or a room (2).
 
     >>> random_scene(3).name
     'random-3'
@@ -123,9 +124,9 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
 def warm_scene(
     plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
 ) -> SyntheticScene:
-    """Return a scene of a plan in metres; the plan's warmth, from least to most, becomes temperatures `surface_c` [C].
+    """Return the scene of a plan in metres, with surface temperatures that are linear in the plan's warmth.
 
-    `rest` are the other fields of the scene by name.
+    The least and the greatest warmth become `surface_c`, two temperatures [C]. For `rest` see `painted_scene`.
     """
     solid = plan.solid()
     lo, hi = np.asarray(solid.bounds)  # the scene box has a margin of 4 % of its longest side all round
@@ -146,7 +147,10 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Return a textured scene of a plan in metres; `solid` None: the plan's; `rest` are the scene's other fields."""
+    """Return the textured scene of a plan in metres; `rest` are further fields of `SyntheticScene`.
+
+    `solid` must be the plan's solid; None: it is made here.
+    """
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
@@ -161,7 +165,7 @@ def painted_scene(
 
 
 def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, float], dict[str, Any]]:
-    """Draw the coldest and hottest temperature of the surface [C], and the fields of the scene for its background."""
+    """Return random lowest and highest surface temperatures [C], and fields of `SyntheticScene` for its background."""
     brightness, spread = np.float32(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
     behind: RgbFunction = sky_rgb if outdoors else room_rgb
     if outdoors:
@@ -195,10 +199,10 @@ _FARTHEST_SHARE = 1.10
 def random_rings(
     draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
 ) -> tuple[CameraRing, ...]:
-    """Draw two or three rings of cameras, from low to high, whose every picture shows all of the boxes [m].
+    """Return two or three random rings of cameras, from low to high. Every camera has all of the boxes [m] in view.
 
     `arc_deg` is begin and length of each ring's arc. `focal_share` is the focal length over the width of a 4:3 image.
-    Cameras stand at most a tenth farther away than the least distance from which all boxes show.
+    Cameras are at most a tenth farther away than the least distance that brings all boxes into view.
     """
     corners = np.array([corner for box in boxes for corner in itertools.product(*zip(*box))], dtype=np.float64)
     lo, hi = corners.min(axis=0), corners.max(axis=0)
@@ -216,10 +220,11 @@ def random_rings(
 
 
 def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
-    """Return the least distance from the origin at which all cameras of an arc, looking at it, see all points (n, 3).
+    """Return the least distance from the origin at which all cameras of an arc have all points (n, 3) in view.
 
-    A camera sees a point whose distances from the view axis, sideways and upwards, are within the half width and half
-    height of the view at the point's depth: beside <= half (distance - nearer), and likewise above.
+    The cameras look at the origin from the angle `elevation` [radians]. A camera has a point in view if the point's
+    offsets from the view axis, sideways and upwards, are at most the half width and half height of the view at the
+    point's depth: beside <= half (distance - nearer), and likewise above.
     """
     azimuth = np.radians(arc_deg[0] + arc_deg[1] * np.linspace(0.0, 1.0, _AZIMUTHS))
     back = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(_AZIMUTHS, math.tan(elevation))], axis=1)
@@ -237,7 +242,7 @@ _GLASS_SHARE, _GLASS_DIM = (0.32, 0.68), 0.35
 
 
 def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
-    """Return a scene with ground, houses with windows, and trees around its cameras, about as warm as the air.
+    """Return the scene with a street around its cameras: ground, houses with windows, and trees, near air temperature.
 
     Houses stand all round, up to 14 times the scene's size away; the ground reaches 26 times the scene's size.
     """
@@ -276,7 +281,7 @@ def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
 
 def with_room(scene: SyntheticScene, seed: int) -> SyntheticScene:
-    """Return a scene in a room around its cameras, about as warm as the air: walls, floor, ceiling and cupboards."""
+    """Return the scene with a room around its cameras: walls, floor, ceiling and cupboards, near air temperature."""
     plan, (x, y), size, reach, floor = _place(scene, seed)
     half = (max(reach, 2.0 * size) * plan.u(1.2, 2.2), max(reach, 2.0 * size) * plan.u(1.2, 2.2))
     top = max(scene.poses(48, 0)[0][:, 2, 3].max(), floor + 1.2 * size) + plan.u(0.3, 1.0) * size
@@ -311,9 +316,10 @@ def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float],
 def surrounded(
     scene: SyntheticScene, plan: Plan, seed: int, range_k: float, windows: tuple[range, float, float] | None = None
 ) -> SyntheticScene:
-    """Return a scene with a plan around it, whose warmth w means w * `range_k` above the temperature of the horizon.
+    """Return the scene with a plan in metres as its surroundings (`around`), which have a texture from `seed`.
 
-    `windows`: indices of the paints of walls with windows, z at which storeys begin [m], height of a storey [m].
+    A place of the plan with the warmth w (cut to 0 to 1) is w * `range_k` warmer than the scene's horizon. `windows` is
+    the indices of the paints of walls with windows, the z at which storeys begin [m], and the height of a storey [m].
     """
     lo = np.asarray(scene.scene_box[0])
     texture, light = SolidTexture(box_between(lo, lo + 3.0 * scene.size), seed), SunLight()

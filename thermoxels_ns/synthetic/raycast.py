@@ -42,10 +42,10 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
 
 
 def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Find the first surface, the scene's or one around it, on rays; origins (n, 3) or (3,) [m], directions (n, 3).
+    """Return the distance (n,) to the first surface on each ray, and whether that surface is the scene's solid (n,).
 
-    Returns:
-        Distances (n,) in lengths of the directions, infinite for no surface, and whether it is the scene's solid (n,).
+    Surroundings of the scene (`around`) count as surfaces. Origins have the shape (n, 3) or (3,) [m], directions (n, 3)
+    of any length. Distances are in lengths of the directions, infinite without a surface.
     """
     distance, _, body = first_hits([body.solid for body in scene.bodies], origins, directions)
     return distance, body == 0
@@ -59,9 +59,10 @@ def visible_surface_points(
     normals: npt.ArrayLike,
     min_views: int = 3,
 ) -> BoolArray:
-    """Return for each surface point (n, 3) [m] whether at least `min_views` of the cameras (c, 4, 4) see it, (n,).
+    """Return a mask (n,), True for surface points (n, 3) [m] that at least `min_views` cameras see.
 
-    A camera sees a point that lies in its image, faces the camera, and is what the ray from the camera meets first.
+    The cameras have the same `camera` and the poses (c, 4, 4). A camera sees a point if the point lies in its image,
+    the outward unit normal (n, 3) there faces the camera, and no other surface is in between.
     """
     points, normals = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     views = np.zeros(len(points), dtype=np.int64)
@@ -81,7 +82,7 @@ def _look(
 ) -> tuple[Float32Array, FloatArray]:
     """Return colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one origin each (n, 3).
 
-    With `mirrors`, mirroring surfaces blend in the colour along the reflected ray; along it no surface mirrors again.
+    With `mirrors`, mirroring surfaces blend in the colour along the reflected ray. Reflected rays meet no more mirrors.
     """
     rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
     solids = [body.solid for body in scene.bodies]

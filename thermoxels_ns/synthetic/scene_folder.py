@@ -27,7 +27,7 @@ _Frames = list[dict[str, Any]]
 LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
 PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
 
-_IN_DEGREES = ("nerfstudio", "thermalmix")  # layouts whose thermal images are .npy; those of the others are 16-bit PNG
+_IN_DEGREES = ("nerfstudio", "thermalmix")  # layouts with thermal images as .npy [C]; all others have 16-bit PNG
 _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
     "thermoscenes": ("images", "thermal", ""),
     "nerfstudio": ("images", "thermal", ""),
@@ -65,18 +65,18 @@ def write_scene(
     progress: bool = True,
     layout: LayoutName = "thermoscenes",
 ) -> Path:
-    """Write photographs and thermal images of a scene, and their poses, into a folder, and return the folder.
+    """Write photographs and thermal images of a scene, and their poses, into a folder, and return the folder's path.
 
-    The `layout` "thermoscenes" is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` (written last)
-    and ``temperature_bounds.json``, with ``frame_train_`` and ``frame_eval_`` names. ``transforms.json`` also has the
-    scale (metres) and up (z), as after a capture. Thermal images are 16-bit PNG that span the temperature bounds.
-    ``docs/data.md`` has the other layouts; "nerfstudio" and "thermalmix" hold degrees as ``.npy``. The scene's name and
-    exact box and the drawn `imperfections` go to ``truth.json``, which training never reads.
+    The `layout` "thermoscenes" has ``images/``, ``thermal/`` with 16-bit PNG that span the temperature bounds,
+    ``temperature_bounds.json`` and, written last, ``transforms.json`` with poses, scale (metres) and up (z). Its files
+    are named ``frame_train_`` and ``frame_eval_``. ``docs/data.md`` describes the other layouts; the thermal images of
+    "nerfstudio" and "thermalmix" are degrees Celsius as ``.npy``. The scene's name and exact box and the drawn
+    `imperfections` are written to ``truth.json``, which training never reads.
 
-    The folder is made if absent; an earlier synthetic scene in it is removed, any other scene is refused. Held-out
-    views lie half-way between training views. With `own_thermal_camera`, thermal images are half as wide as
-    photographs and have a lens and poses of their own, ``thermal_camera`` and ``thermal_transform_matrix``. The same
-    `seed` writes the same bytes.
+    An earlier synthetic scene in the folder is removed. Held-out views (`num_eval`) lie between training views
+    (`num_train`). Photographs have `width` x `height` pixels. With `own_thermal_camera`, thermal images are half as
+    wide and have a lens (``thermal_camera``) and poses (``thermal_transform_matrix``) of their own. The same `seed`
+    writes the same bytes.
 
     Raises:
         SceneError: An option is out of range, or the folder contains a scene that is not synthetic.
@@ -145,8 +145,11 @@ def write_scene(
 
 
 def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
-    """Return the frames of pairs as ThermalNeRF has them: all photographs, then all thermal images, each with its
-    camera. The keys of `camera`, the photographs', are removed from it."""
+    """Return frames as ThermalNeRF has them: all photographs, then all thermal images, each with its camera's entries.
+
+    `camera` and `own` are the entries of photographs' and thermal camera. The former, but for camera_model, are removed
+    from `camera` in place.
+    """
     poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
     kept = {key: camera.pop(key) for key in own if key != "camera_model"}
     seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
@@ -160,7 +163,11 @@ def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any
 def _write_colmap_model(
     folder: Path, scene: SyntheticScene, poses: FloatArray, frames: _Frames, camera: Camera, given: Camera, seed: int
 ) -> None:
-    """Write a COLMAP model as text, with points of the surface and the photographs that see them from `poses`."""
+    """Write a COLMAP model as text into `folder`: random surface points, and the photographs that see each point.
+
+    The true `poses` (n, 4, 4) and `camera` decide what is seen. The written poses are those in `frames` and the written
+    lens is `given`; both may have errors.
+    """
     generator, points = np.random.default_rng(seed), []
     for pose in poses:
         rays = camera.directions(pose).reshape(-1, 3)
@@ -199,7 +206,7 @@ def _write_colmap_model(
 
 
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
-    """Return the exact scene from which a folder was written; None for real photographs (no ``truth.json``).
+    """Return the exact scene from which a folder was written; None without a ``truth.json``, as for real photographs.
 
     Raises `SceneError` if ``truth.json`` is unreadable, or names a scene that does not exist.
     """
@@ -234,7 +241,7 @@ def _thermal_camera(scene: SyntheticScene, width: int, height: int, own: bool) -
 
 
 def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
-    """Make the folders and remove an earlier synthetic scene; raise `SceneError` for any other scene in the folder."""
+    """Make the folders of a layout, remove an earlier synthetic scene, and return the path; refuse any other scene."""
     target = writable_folder(folder)
     models = [f"{model}/{part}.txt" for *_, model in _FOLDERS.values() for part in ("cameras", "images", "points3D")]
     if (target / TRUTH).is_file():

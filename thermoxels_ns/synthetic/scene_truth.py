@@ -21,7 +21,11 @@ _ASPECT = 4.0 / 3.0
 
 
 def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
-    """Return the pose (4, 4) of a camera at `position` that looks at `target`, not straight up or down; z is up."""
+    """Return the camera-to-world pose (4, 4) of a camera at `position` (3,) that looks at `target` (3,).
+
+    The camera's axes are x right, y up, z back (OpenGL); the world's z is up. The caller must not pass a target that is
+    straight above or below the camera.
+    """
     position = np.asarray(position, dtype=np.float64)
     back = position - np.asarray(target, dtype=np.float64)
     right = np.cross((0.0, 0.0, 1.0), back)
@@ -35,7 +39,7 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class CameraRing:
-    """A horizontal circle, or an arc of a circle, of cameras that look at one point."""
+    """Cameras on a horizontal circle, or on an arc of it, that all look at one point."""
 
     target: Vector  # point at which all cameras look, on the axis of the circle [m]
     radius_m: float  # horizontal distance from the axis [m]
@@ -45,11 +49,11 @@ class CameraRing:
 
     @property
     def closed(self) -> bool:
-        """True for a full circle, where the last camera is a neighbour of the first."""
+        """True for a full circle. Its last camera is then a neighbour of its first."""
         return self.span_deg >= 360.0
 
     def pose(self, share: float) -> FloatArray:
-        """Return the pose (4, 4) at a share of the arc, 0 to 1, camera to world."""
+        """Return the camera-to-world pose (4, 4) at `share` of the arc, 0 (begin) to 1 (end), see `look_at`."""
         azimuth = math.radians(self.start_deg + self.span_deg * share)
         x = self.target[0] + self.radius_m * math.cos(azimuth)
         y = self.target[1] + self.radius_m * math.sin(azimuth)
@@ -57,20 +61,23 @@ class CameraRing:
 
 
 def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
-    """Return a `CameraRing` about `middle` (x, y) for each z of target, radius and z of cameras [m], all with `arc`."""
+    """Return a `CameraRing` around `middle` (x, y) for each of `rings`: z of the target, radius, z of the cameras [m].
+
+    `arc` are further arguments of every `CameraRing`: `start_deg` and `span_deg`.
+    """
     return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
 
 
 @dataclass(frozen=True)
 class CameraWalk:
-    """A straight line of cameras that look at points of a second line, in step."""
+    """Cameras on a straight line. The camera at a share of it looks at the point at that share of a second line."""
 
     ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
     aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
     closed: bool = False  # the last camera is no neighbour of the first
 
     def pose(self, share: float) -> FloatArray:
-        """Return the pose (4, 4) at a share of the line, 0 to 1, camera to world."""
+        """Return the camera-to-world pose (4, 4) at `share` of the line, 0 (begin) to 1 (end), see `look_at`."""
         position, aim = (np.add(a, share * np.subtract(b, a)) for a, b in (self.ends, self.aims))
         return look_at(position, aim)
 
@@ -78,10 +85,11 @@ class CameraWalk:
 def ring_poses(
     rings: Sequence[CameraRing | CameraWalk], num_train: int, num_eval: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return training poses (num_train, 4, 4), evenly spread over rings, and evaluation poses (num_eval, 4, 4) between.
+    """Return camera-to-world poses of training cameras (num_train, 4, 4) and of evaluation cameras (num_eval, 4, 4).
 
-    Cameras go to the rings in turn; each ring starts a fraction of a step later than the ring before. The evaluation
-    cameras in a gap between neighbours divide it evenly. Raises `SceneError` for too small a number of cameras.
+    Cameras are dealt out to the rings in turn. On a ring, training cameras are evenly spaced; each ring starts a
+    fraction of a step later than the ring before. Evaluation cameras divide gaps between training cameras evenly.
+    Raises `SceneError` if `num_train` is below 1 or `num_eval` below 0.
     """
     if num_train < 1 or num_eval < 0:
         expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"
@@ -108,7 +116,7 @@ class Body:
     solid: Solid  # everything that is not air; lengths in metres
     colour: RgbFunction  # function of points (n, 3) and normals (n, 3) to red, green, blue in [0, 1] (n, 3)
     surface_temperature_c: DegreesFunction
-    """Function of points (n, 3) to temperatures (n,) [C], the same from all sides; smooth, also off the surface."""
+    """Function of points (n, 3) to temperatures (n,) [C], the same from all directions; smooth also off the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +125,15 @@ class SyntheticScene(Body):
 
     name: str
     scene_box: Box  # lower and upper corner of the box to reconstruct, which contains the solid
-    temperature_bounds_c: tuple[float, float]
-    """Bounds of the temperatures of all surfaces and of the background."""
+    temperature_bounds_c: tuple[float, float]  # bounds of the temperatures of all surfaces and of the background
     background_rgb: RgbFunction  # function of unit directions (n, 3), away from the camera, to colours (n, 3)
     background_temperature_c: DegreesFunction  # function of such directions to temperatures (n,) [C]
     rings: tuple[CameraRing | CameraWalk, ...]  # where cameras stand
     focal_share: float  # focal length over the image width, for a 4:3 image
     around: Body | None = None
-    """Things between the scene and infinity that photographs show, such as houses opposite; meshes leave them out."""
+    """Surroundings, such as houses opposite, that photographs show and that meshes leave out; None: no surroundings."""
     mirror: RgbFunction | None = None
-    """Function of points (n, 3) and normals (n, 3) to the share of light (n,) that the surface mirrors; None: none."""
+    """Function of points (n, 3) and normals (n, 3) to the share of light (n,) that the surface mirrors; None: 0."""
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -139,10 +146,10 @@ class SyntheticScene(Body):
         return float(np.subtract(self.scene_box[1], self.scene_box[0]).max())
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return a camera of the given image size [pixels] that frames the scene from every pose of the rings."""
+        """Return a camera of this image size [pixels] that shows the whole scene from every pose of the rings."""
         focal = self.focal_share * min(float(width), height * _ASPECT)
         return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
     def poses(self, num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
-        """Return training (num_train, 4, 4) and held-out poses (num_eval, 4, 4), camera to world (OpenGL axes)."""
+        """Return the training poses (num_train, 4, 4) and held-out poses (num_eval, 4, 4), see `ring_poses`."""
         return ring_poses(self.rings, num_train, num_eval)

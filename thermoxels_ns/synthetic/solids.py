@@ -22,43 +22,38 @@ _PARALLEL_SINE_SQUARED = 1e-30
 
 
 class Solid(Protocol):
-    """A solid body, its surface included; lengths in metres. All values are exact up to rounding."""
+    """A closed solid body: its surface belongs to it. Lengths are in metres; all values are exact up to rounding."""
 
-    bounds: Box
-    """Lower and upper corner of the smallest box around the solid [m]."""
-    volume: float
-    """Volume [m3]."""
-    area: float
-    """Area of the surface [m2]."""
+    bounds: Box  # lower and upper corner of the smallest box around the solid [m]
+    volume: float  # volume [m3]
+    area: float  # area of the surface [m2]
 
     def contains(self, points: npt.ArrayLike, /) -> BoolArray:
-        """Return for each of the points (n, 3) whether it lies in the solid or on its surface, shape (n,)."""
+        """Return a mask (n,), True for each of the points (n, 3) [m] that lies in the solid or on its surface."""
         return self.signed_distance(points) <= 0.0
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """Return the distance of each of the points (n, 3) to the surface [m], negative inside, shape (n,)."""
+        """Return the signed distances (n,) [m] of points (n, 3) [m] to the surface, negative inside the solid."""
         ...
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Find where rays first enter the solid: origins (n, 3) or one shared (3,), directions (n, 3).
+        """Return where rays first enter the solid: distances (n,) and outward unit normals (n, 3) at the entry points.
 
-        Only passing from outside to inside counts: a ray that starts inside does not see the surface from behind.
-        Touching an edge counts as a hit.
-
-        Returns:
-            Distances (n,) in multiples of the direction's length, infinite for a miss, and outward unit normals (n, 3),
-            zero for a miss.
+        The rays start at `origins`, (n, 3) or one shared (3,) [m], and run along `directions` (n, 3) of any length.
+        Distances are in multiples of the direction's length. For a miss, the distance is infinite and the normal zero.
+        Only an entry from outside counts: a ray that starts inside does not hit the surface from behind. A ray that
+        touches an edge hits the solid.
         """
         ...
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return random points on the surface, uniform by area: positions and outward unit normals, (count, 3) each."""
+        """Return random surface points (count, 3) [m], uniform by area, and their outward unit normals (count, 3)."""
         ...
 
 
 @dataclass(eq=False)
 class Sphere(Solid):
-    """A ball; radius above 0 [m]."""
+    """A ball around `centre` [m] with `radius` [m] above 0."""
 
     centre: Vector
     radius: float
@@ -69,11 +64,11 @@ class Sphere(Solid):
         self.area = 4.0 * math.pi * self.radius**2
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """See `Solid`."""
+        """Return the signed distance of each point, see `Solid.signed_distance`."""
         return np.linalg.norm(np.subtract(points, self.centre), axis=-1) - self.radius
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return where rays enter the solid, see `Solid.intersect`."""
         directions = np.asarray(directions, dtype=np.float64)
         start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
         enter, _ = _through_circle(start, directions, self.radius)
@@ -82,7 +77,7 @@ class Sphere(Solid):
         return np.where(hit, enter, np.inf), np.where(hit[:, None], normal, 0.0)
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return random surface points and their normals, see `Solid.surface_points`."""
         normals = np.random.default_rng(seed).standard_normal((count, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(self.centre) + self.radius * normals, normals
@@ -90,7 +85,7 @@ class Sphere(Solid):
 
 @dataclass(eq=False)
 class Cylinder(Solid):
-    """A closed circular cylinder with flat ends whose axis is parallel to x, y or z.
+    """A solid circular cylinder with flat ends. Its axis is parallel to x, y or z.
 
     >>> Cylinder((0.0, 0.0, 1.0), radius=0.5, length=2.0, axis=2).bounds
     ((-0.5, -0.5, 0.0), (0.5, 0.5, 2.0))
@@ -109,7 +104,7 @@ class Cylinder(Solid):
         self._across = [a for a in range(3) if a != self.axis]
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """See `Solid`."""
+        """Return the signed distance of each point, see `Solid.signed_distance`."""
         relative = np.subtract(points, self.centre)
         beside = np.linalg.norm(relative[:, self._across], axis=1) - self.radius
         beyond = np.abs(relative[:, self.axis]) - 0.5 * self.length
@@ -117,7 +112,7 @@ class Cylinder(Solid):
         return np.asarray(outside + np.minimum(np.maximum(beside, beyond), 0.0), dtype=np.float64)
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`. A ray enters where it is both between the planes of the ends and in the endless cylinder."""
+        """See `Solid.intersect`. Rays enter where they are first between the end planes and in the endless cylinder."""
         directions = np.asarray(directions, dtype=np.float64)
         start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
         side_in, side_out = _through_circle(start[:, self._across], directions[:, self._across], self.radius)
@@ -138,7 +133,7 @@ class Cylinder(Solid):
         return np.where(hit, entry, np.inf), normal
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return random surface points and their normals, see `Solid.surface_points`."""
         draw = np.random.default_rng(seed)
         on_side = draw.random(count) < self.length / (self.length + self.radius)
         angle = 2.0 * math.pi * draw.random(count)
@@ -184,10 +179,10 @@ class BoxSolid(Solid):
         self.bounds = box_between(self._lo.min(axis=0), self._hi.max(axis=0))
 
     def _find_rectangles(self) -> None:
-        """Cover the surface once by large rectangles: set `_lo`, `_hi`, `_normals` and `_planes`.
+        """Set `_lo`, `_hi`, `_normals` and `_planes` to m large rectangles that cover the surface without overlap.
 
-        Lower corners, upper corners [m] and outward unit normals have shape (m, 3). Each plane is its axis, the sign of
-        its normal, its coordinate [m] and the numbers of its rectangles.
+        `_lo` and `_hi` are lower and upper corners [m], `_normals` outward unit normals, each of shape (m, 3). Each of
+        `_planes` holds the axis and sign of its normal, its coordinate [m], and the indices of its rectangles.
         """
         filled, found = np.pad(self._cells, 1).astype(np.int8), []
         self._planes: list[tuple[int, int, float, range]] = []
@@ -208,7 +203,7 @@ class BoxSolid(Solid):
         self._lo, self._hi, self._normals = np.stack(found, axis=1)
 
     def contains(self, points: npt.ArrayLike, /) -> BoolArray:
-        """See `Solid`; a point on a plane of the grid belongs to the cells on both sides."""
+        """Return the mask of `Solid.contains`. A point on a plane of the grid belongs to the cells on both sides."""
         padded, columns = np.pad(self._cells, 1), np.asarray(points, dtype=np.float64).T
         sides = (
             [np.searchsorted(edge, at, side="left"), np.searchsorted(edge, at, side="right")]
@@ -217,14 +212,14 @@ class BoxSolid(Solid):
         return np.any([padded[cell] for cell in itertools.product(*sides)], axis=0)
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """See `Solid`."""
+        """Return the signed distance of each point, see `Solid.signed_distance`."""
         nearest = np.full(len(np.asarray(points)), np.inf)
         for lo, hi in zip(self._lo, self._hi):
             nearest = np.minimum(nearest, distance_to_box(points, lo, hi))
         return np.where(self.contains(points), -nearest, nearest)
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`. Rectangles are widened by a billionth of the solid's size, so that no ray slips between two."""
+        """See `Solid.intersect`. Rectangles are widened by 1e-9 of the solid's size, so that no ray slips through."""
         direction = np.ascontiguousarray(np.asarray(directions, dtype=np.float64).T)
         origin = np.ascontiguousarray(np.broadcast_to(origins, direction.T.shape).T, dtype=np.float64)
         slack = _EDGE_TOLERANCE * float(np.subtract(self.bounds[1], self.bounds[0]).max())
@@ -246,7 +241,7 @@ class BoxSolid(Solid):
         return best, np.concatenate([self._normals, np.zeros((1, 3))])[index]
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return random surface points and their normals, see `Solid.surface_points`."""
         draw, lo, hi = np.random.default_rng(seed), self._lo, self._hi
         chosen = draw.choice(len(lo), size=count, p=self._areas / self._areas.sum())
         return lo[chosen] + draw.random((count, 3)) * (hi[chosen] - lo[chosen]), self._normals[chosen]
@@ -254,7 +249,7 @@ class BoxSolid(Solid):
 
 @dataclass(eq=False)
 class SolidUnion(Solid):
-    """Solids side by side that share no volume and no face; a round solid may touch others in a point or a line."""
+    """The union of solids that share no volume and no face. A round solid may touch others in a point or a line."""
 
     parts: tuple[Solid, ...]
     """The solids. Touching boxes must be in one `BoxSolid`, which leaves their shared face out of the surface."""
@@ -266,15 +261,15 @@ class SolidUnion(Solid):
         self.area = sum(part.area for part in self.parts)
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """See `Solid`."""
+        """Return the signed distance of each point, see `Solid.signed_distance`."""
         return np.min([part.signed_distance(points) for part in self.parts], axis=0)
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return where rays enter the solid, see `Solid.intersect`."""
         return first_hits(self.parts, origins, directions)[:2]
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """Return random surface points and their normals, see `Solid.surface_points`."""
         areas = np.array([part.area for part in self.parts])
         shares = np.random.default_rng(seed).multinomial(count, areas / areas.sum())
         parts = enumerate(zip(self.parts, shares), start=seed + 1)
@@ -286,7 +281,7 @@ class SolidUnion(Solid):
 def first_hits(
     solids: Sequence[Solid], origins: npt.ArrayLike, directions: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return distance (n,), normal (n, 3) and number of the solid (n,; -1: none) that rays meet first: see `Solid`."""
+    """Return each ray's first entry, as `Solid.intersect` does, and the index (n,) of the solid entered; -1: none."""
     distance, normal = map(np.array, zip(*(solid.intersect(origins, directions) for solid in solids)))
     first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
     nearest = distance[first, every]
@@ -294,13 +289,13 @@ def first_hits(
 
 
 def box_between(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:
-    """Return the box with these lower and upper corners, as plain numbers."""
+    """Return the box with lower corner `lo` and upper corner `hi`, each (3,), as tuples of Python numbers."""
     (x0, y0, z0), (x1, y1, z1) = np.asarray(lo).tolist(), np.asarray(hi).tolist()
     return (x0, y0, z0), (x1, y1, z1)
 
 
 def box_beside(axis: int, across: tuple[float, float], along: tuple[float, float], height: tuple[float, float]) -> Box:
-    """Return the box with these extents: along `axis` (0 or 1, in any order), along the other of the two, and in z."""
+    """Return a box that spans `across` (ends in any order) on `axis` (0: x, 1: y), `along` on y or x, `height` in z."""
     through = (min(across), max(across))
     (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
     return (x0, y0, height[0]), (x1, y1, height[1])
@@ -318,9 +313,10 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
 
 
 def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
-    """Return where rays (n, 2 or 3) enter and leave a circle or ball around the origin; for a miss inf and -inf.
+    """Return the distances (n,) at which rays enter and leave a circle or ball around the origin; a miss: inf and -inf.
 
-    The half chord is found from the foot of the perpendicular, which keeps its digits for far origins.
+    The rays run from `start` along `way`, both (n, 2) or (n, 3); distances are in lengths of `way`. The half chord is
+    computed at the foot of the perpendicular, so that it keeps its digits for a far start.
     """
     squared = np.einsum("ij,ij->i", way, way)
     # A ray along a cylinder's axis, or tilted from the axis by less than rounding, is inside for ever or never.
@@ -334,7 +330,7 @@ def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[
 
 
 def _merged_blocks(mask: BoolArray) -> Iterator[tuple[int, int, int, int]]:
-    """Yield disjoint blocks [u0, u1) x [v0, v1) that cover the true entries of a mask, grown along v, then u."""
+    """Yield u0, u1, v0, v1 of disjoint blocks [u0, u1) x [v0, v1) that together cover the True entries of `mask`."""
     left = mask.copy()
     for u0, v0 in np.argwhere(mask):
         if not left[u0, v0]:

@@ -20,10 +20,9 @@ _RADIAL_TERMS = 2
 _HUBER = 1.345
 _MAD_TO_SIGMA = 1.4826
 _ITERATIONS = 30
-_CONVERGED_K = 1e-3  # the fit ends when no unknown changes by more; offsets are uncertain by more than this anyway
+_CONVERGED_K = 1e-3  # the fit ends when no unknown changes by more than this, less than the offsets' uncertainty
 _HELD_OUT_EVERY = 5
-_MOST_LAG = 6
-"""Each reading of a point is compared with at most so many earlier readings of the same point."""
+_MOST_LAG = 6  # largest number of earlier readings of the same point with which a reading is compared
 _FEWEST_POINTS = 50
 _GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
 _RIDGE = 1e-9
@@ -35,15 +34,14 @@ _BORDER_PX = 2.0
 def estimate_drift(
     frames: Sequence[RigFrame], thermal_camera: Camera, visible_to_thermal: npt.ArrayLike
 ) -> DriftEstimate:
-    """Find one offset per thermal image and a radial term, if they make the readings of scene points agree better.
+    """Return one offset per thermal image and a radial term, if they make the readings of scene points agree better.
 
     An uncooled camera reads some kelvin too high or too low from image to image, and warmer or colder towards the
-    corners. A scene point has one temperature, so differences between its readings show both errors.
-
-    Reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Offsets and coefficients are
-    fitted to differences of two readings of one point by robust least squares (Huber's loss, reweighted), mean offset
-    0. As a test, four fifths of the points are fitted: if that does not lower the differences at the other points, the
-    result has offsets of zero, `used` False and the reason.
+    corners. A scene point has one temperature, so differences between its readings show both errors. The model is:
+    reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Offsets (mean 0) and
+    coefficients are fitted to differences of two readings of one point by robust least squares (Huber's loss,
+    iteratively reweighted). As a test, they are first fitted to four fifths of the points. If this does not lower the
+    differences at the other points, the result has offsets of zero, `used` False and the reason.
     """
     return drift_of_samples(sample_shared_points(frames, thermal_camera, np.asarray(visible_to_thermal, np.float64)))
 
@@ -54,7 +52,7 @@ def _no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
 
 
 def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
-    """Find the drift from readings of scene points, as `estimate_drift` describes."""
+    """Return the drift that explains the readings of scene points in `samples`, as `estimate_drift` describes."""
     frames = samples.num_frames
     points = int(samples.point[-1]) + 1 if len(samples.point) else 0
     if points < _FEWEST_POINTS:
@@ -90,9 +88,9 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
 
 
 def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArray]:
-    """Return the differences of two readings of one point: point numbers (n,), a matrix, and differences (n,) [K].
+    """Return the differences of pairs of readings of one point: point numbers (n,), matrix, and differences (n,) [K].
 
-    The matrix, shape (n, frames + radial terms), times offsets and radial coefficients gives the differences by drift.
+    The matrix (n, frames + radial terms), times the offsets and radial coefficients, is what drift adds to them.
     """
     pairs = []
     for lag in range(1, _MOST_LAG + 1):
@@ -110,7 +108,7 @@ def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArra
 
 
 def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknowns: int) -> FloatArray:
-    """Solve design @ x = difference_k for x by robust least squares (Huber's loss), rows weighted by `share`."""
+    """Return the solution x (unknowns,) of design @ x = difference_k by Huber's least squares with weights `share`."""
     solution, weight, used = np.zeros(unknowns), share, share > 0.0
     for _ in range(_ITERATIONS):
         weighted = design.multiply(weight[:, None]).tocsr()
@@ -137,10 +135,10 @@ class DriftSamples:
 
 
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
-    """Read the temperature of scene points in all thermal images in whose photographs structure from motion saw them.
+    """Return the readings of each scene point in the thermal images of all frames whose photographs show the point.
 
-    Points on steep temperature edges are left out, because there a small error in place is a large error in
-    temperature.
+    `visible_to_thermal` (4, 4) is the rig's transform. Points on steep temperature edges are left out, because a small
+    error of their place is a large error of temperature.
     """
     columns = []
     for number, frame in enumerate(frames):
@@ -161,7 +159,7 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
 
 
 def _read(image: Float32Array, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return slightly smoothed temperatures (n,) at pixels (n, 2), and the slope there (n,) [K/pixel]."""
+    """Return slightly smoothed temperatures (n,) at pixels (n, 2), and their gradients' magnitudes (n,) [K/pixel]."""
     smooth = cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)  # NaN spreads; left out later
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
     gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)

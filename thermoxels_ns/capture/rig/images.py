@@ -24,15 +24,15 @@ _MOST_POINTS = 6_000
 _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
-"""If the nearest scene point is farther from an edge (on the plane at depth 1), the edge's depth counts as unknown."""
-SURE_DISTANCE = 0.01  # an edge so far from the nearest scene point, both drawn to depth 1, has half the weight
+"""Distance from an edge to the nearest scene point, both at depth 1, beyond which the edge's depth is unknown."""
+SURE_DISTANCE = 0.01  # distance from an edge to the nearest scene point, both at depth 1, with half the weight
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
 _GRADIENT_SIGMA_PX = 1.2
 _NOISE_FACTOR = 3.0
 _STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
-"""In an image without noise, an edge of `_SMALLEST_SHARE` of the strong edges' |z| counts a half (`edge_field`)."""
+"""In an image without noise, an edge of `_SMALLEST_SHARE` of the strong edges' |z| has the value 1/2: `edge_field`."""
 _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
@@ -49,21 +49,21 @@ class EdgePoints:
 
 
 class ThermalEdges:
-    """Edge values (`edge_field`) of one thermal image, which can be sampled between pixel centres."""
+    """Edge values (`edge_field`) of one thermal image, interpolated linearly between pixel centres."""
 
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
-        """Store edge values, shape (height, width), and their slopes."""
+        """Store edge values `field` (height, width), their derivatives, and weights that fall to 0 at the border."""
         self.field = field
         self.weight: Float32Array = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
         padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
         self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
     def sample(self, pixels: FloatArray) -> npt.NDArray[np.complex64]:
-        """Return edge values and their derivatives by x and y, shape (3, n), at pixels (n, 2); 0 outside."""
+        """Return edge values and their derivatives by x and y, (3, n), at pixel positions (n, 2); outside: 0."""
         return np.stack([_bilinear(plane, pixels) for plane in self._planes])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
-        """Return the weights, 0 to 1, of points at pixels (n, 2), shape (n,); weights are 0 at the image's border."""
+        """Return the weights (n,), 0 at the image's border to 1, of points at pixel positions (n, 2)."""
         return _bilinear(np.pad(self.weight, _PADDING), pixels).astype(np.float64)
 
 
@@ -71,21 +71,21 @@ class RigScore:
     """Score of how well a rig makes the edges of all frames agree, at one size of the thermal images.
 
     The edges of every photograph are points in front of its camera, each with an edge value a. A rig projects each
-    point into the thermal image, whose edge value there is b. The score of the rig is sum(w Re a* b) over the points of
-    all frames. The weights w fall to 0 at the border of the thermal image, and stay while the rig changes. If the score
-    were divided by a changing sum(w |b|^2), or the weights followed the rig, it would pay to move points to where b is
-    small, and the focal length would come out half a percent too long.
+    point into the thermal image, which has the edge value b there. The score of the rig is sum(w Re a* b) over the
+    points of all frames. The weights w fall to 0 at the border of the thermal image and are constant while the rig
+    changes. If weights changed with the rig, or if the score were divided by sum(w |b|^2), points could gain by moving
+    to places with a small b, and the focal length found would be half a percent too long.
     """
 
     def __init__(
         self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
     ) -> None:
-        """Store the edges of each frame and the start `rig`; the weights are those at the changes `around` (10,)."""
+        """Store the edges of each frame and the start `rig`; weights are computed at the ten changes `around` (10,)."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return the score of the rig with the ten changes `change`, and its derivative per frame, (frames, 10)."""
+        """Return the score at the ten changes `change` (10,), and each frame's part of its derivative, (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
             sampled = thermal.sample(self.rig.project(change, one.points))
@@ -114,13 +114,16 @@ class PreparedFrames:
     median_depth: float  # of all scene points [world units]
 
     def sizes(self) -> list[tuple[int, int]]:
-        """Return the sizes (width, height) of thermal images to compare at, from coarse to the full size."""
+        """Return the sizes (width, height) at which thermal images are compared, halvings of the full size, rising."""
         width, height = self.thermal.width, self.thermal.height
         halvings = max(round(np.log2(max(width / _COARSEST_WIDTH, 1.0))), 0)
         return [(round(width / 2**k), round(height / 2**k)) for k in range(halvings, -1, -1)]
 
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
-        """Return the `RigScore` around `change` (10,) for thermal images of `size` (width, height) and edges' blur."""
+        """Return the `RigScore` for thermal images of `size` (width, height), with weights at the ten changes `change`.
+
+        `blur_px` is the standard deviation of the edges' blur [thermal pixels at that size].
+        """
         level = rig.at_size(*size)
         edges, thermal = [], []
         for frame in self.frames:
@@ -130,7 +133,11 @@ class PreparedFrames:
         return RigScore(edges, thermal, level, change)
 
     def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
-        """Return the strongest edges of a photograph that is reduced to pixels a little smaller than thermal pixels."""
+        """Return the strongest edges of a frame's photograph, reduced to pixels a little smaller than thermal pixels.
+
+        `level` is the rig at the thermal images' size. Left out are edges that it projects, with the changes `change`,
+        far outside the thermal image, and edges of unknown depth.
+        """
         # With pixels of the same size, the score would prefer whole-pixel shifts, where interpolation blurs nothing.
         height, width = frame.grey.shape
         same = level.camera.fl_x / self.visible.resized(width, height).fl_x
@@ -159,7 +166,7 @@ class PreparedFrames:
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera) -> PreparedFrames:
-    """Read the images of all frames and remove the fixed pattern; raise `SceneError` for a file that is damaged."""
+    """Return the images of all frames without the sensor's fixed pattern; raise `SceneError` if a file is damaged."""
     temperatures = [read_temperatures(frame) for frame in frames]
     prepared, depths = [], []
     for frame, contrast in zip(frames, without_fixed_pattern(temperatures)):
@@ -176,7 +183,7 @@ def read_temperatures(frame: RigFrame) -> FloatImage:
 
 
 def read_photograph(frame: RigFrame) -> FloatImage:
-    """Return a frame's photograph as grey values, not turned by EXIF; raise `SceneError` if it cannot be decoded."""
+    """Return a frame's photograph as grey values (height, width), not turned by EXIF; `SceneError`: not decodable."""
     source = frame.photograph
     if isinstance(source, Path):
         image = np.asarray(open_photograph(source).convert("L"))
@@ -187,16 +194,14 @@ def read_photograph(frame: RigFrame) -> FloatImage:
 
 
 def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0) -> npt.NDArray[np.complex64]:
-    """Return complex edge values of magnitude 0 (no edge) to 1 and twice the edge's angle, shape (height, width).
+    """Return complex edge values (height, width): magnitude 0 (no edge) to 1, phase twice the angle of the gradient.
 
-    A warm object may be bright or dark, so the sign of an edge says nothing; only place and direction count. The
-    squared gradient z = (gx + i gy)^2 is the same for an edge and its negative.
-
-    The edge value is z / (|z| + c), so strong edges all count nearly 1 and noise counts little; c is a multiple of the
-    median of |z|, which is the level of noise in a mostly flat image. NaN pixels and pixels near them count as no edge.
-
-    The edge values are then blurred by the standard deviation `blur_px`, so that edges agree from that far apart. Its
-    unit is one coarse pixel, as wide as `pixels_per_pixel` pixels of the image.
+    A warm object may be bright or dark in a photograph, so only place and direction of an edge are compared, not its
+    sign. The squared gradient z = (gx + i gy)^2 is the same for an edge and its negative. The edge value is
+    z / (|z| + c), so that strong edges have nearly 1 and noise has little. c is a multiple of the median of |z|, which
+    is the level of noise in a mostly flat image. NaN pixels and pixels near them have no edge. The values are then
+    blurred, so that edges a little apart also agree. The blur's standard deviation is `blur_px` coarse pixels, each as
+    wide as `pixels_per_pixel` pixels of the image.
     """
     bad = ~np.isfinite(image)
     filled = np.where(bad, np.float32(np.nanmedian(image) if not bad.all() else 0.0), image).astype(np.float32)
@@ -218,10 +223,10 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
 
 
 def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
-    """Return the `local_contrast` of each image [K] without the sensor's fixed pattern.
+    """Return the `local_contrast` of each thermal image [K] without the sensor's fixed pattern.
 
-    Rows, columns and single pixels of a sensor may read differently. The pattern is the median local contrast over the
-    images, and is subtracted only if there are enough images and its medians over two halves of them correlate.
+    Rows, columns and single pixels of a sensor may read differently. This pattern is the median of the local contrast
+    over all images. It is subtracted only if there are enough images and the medians of two halves correlate.
     """
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:
@@ -234,7 +239,7 @@ def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
 
 
 def local_contrast(image: FloatImage) -> FloatImage:
-    """Return each pixel minus the mean of its surroundings, free of drift and vignetting, [K]; NaN stays NaN."""
+    """Return each pixel minus the mean of its surroundings [K], which removes drift and vignetting; NaN remains NaN."""
     known = np.isfinite(image)
     filled = np.where(known, image - image[known].mean(dtype=np.float64), 0.0) if known.any() else image
     reach = max(_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE * image.shape[1])
@@ -244,12 +249,12 @@ def local_contrast(image: FloatImage) -> FloatImage:
 
 
 def _bilinear(padded: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
-    """Sample a plane padded by `_PADDING` zeros at pixels (n, 2) counted without the padding; NaN pixels read 0."""
+    """Return bilinear samples (n,) of a plane padded by `_PADDING` zeros, at `pixels` (n, 2) of it unpadded; NaN: 0."""
     place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T + (_PADDING - 0.5)
     return ndimage.map_coordinates(padded, place, order=1, mode="nearest")
 
 
 def _ramp(length: int) -> FloatArray:
-    """Return weights for a row of pixels, shape (length,): 0 near both ends, where edges are unsure, rising to 1."""
+    """Return weights (length,) for a row of pixels: 0 at both ends, because edges are unsure there, rising to 1."""
     distance = np.minimum(np.arange(length) + 0.5, length - np.arange(length) - 0.5) - _BORDER_PX
     return np.clip(distance / max(_BORDER_SHARE * length, 2.0), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Maximises scores of rigs, and refines a rig by small windows in which temperature follows brightness."""
+"""Maximises scores of rigs, and refines a rig by small windows in which temperature is linear in brightness."""
 
 from __future__ import annotations
 
@@ -19,47 +19,50 @@ _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
 THERMAL_BLUR_PX = 0.6
-"""Standard deviation of a blur of both images, so that interpolation does not matter [thermal pixels]."""
+"""Standard deviation [thermal pixels] of a blur of both images, which makes errors of interpolation negligible."""
 _NOISE_TO_MEDIAN = 0.6745
 _NOISE_KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
 _SMALLEST_VARIANCE = 1e-8
 _STEP_PX = 1e-3
 _BLOCKS = 4
-"""Every image is divided into _BLOCKS x _BLOCKS parts, whose contributions to a slope count as independent."""
+"""Every image is divided into _BLOCKS x _BLOCKS parts; their contributions to a derivative count as independent."""
 _PITCH = 1.3  # pixels of the reduced photograph per thermal pixel
 _WINDOW_PX = 1.0
 _LENS_BLURS_PX = (0.0, 0.5, 0.8, 1.2, 1.6)
-"""Standard deviations of the thermal lens's blur that are tried; the pixel's own blur is added [thermal pixels]."""
+"""Standard deviations [thermal pixels] of the thermal lens's blur that are tried; the pixel's own blur is added."""
 _BLUR_FRAMES, _BLUR_WINDOWS = 8, 1000
-"""Number of frames, and of windows in each, that choose the blur and test whether windows agree at all."""
+"""Numbers of frames, and of windows in each, with which the blur is chosen and the agreement is tested."""
 _MOST_WINDOWS = 3000
-_AGREEMENT = 0.9  # a window counts if its R2 (`WindowScore`) is above this
+_AGREEMENT = 0.9  # a window agrees if its R2 (`WindowScore`) is above this
 _REACHES_PX = (0.5, 0.25, 0.0, 0.0)
-"""In each round, a window counts if it agrees somewhere within this distance along x and y [thermal pixels]."""
+"""Distance [thermal pixels] along x and y, in each round, within which a window must agree somewhere to be used."""
 _FEWEST_WINDOWS = 150
 _ABOVE_CHANCE = 3.0
 _ELSEWHERE_PX = 5.0
 _MOST_SHIFT_PX = 2.0
 _CORRELATED_FRAMES = 6
-"""Number of frames that together count as one independent frame. In five drawn captures of 36 frames the turn erred by
-0.09 degrees (median) with 6 and by 0.22 with all frames as one; with 1, four of these captures erred no less."""
+"""Number of frames that together count as one independent frame. In five synthetic captures of 36 frames, the turn was
+wrong by 0.09 degrees (median) with 6, and by 0.22 with 36; with 1, it was no better in four of these captures."""
 _STATED_SHARE = 0.25
-"""Share of the windows' information that the covariance is computed from. In drawn captures with known rigs, principal
-point and turn erred by one to two times the standard errors that follow from the scatter of the windows."""
+"""Share of the windows' information that the covariance is computed from. In synthetic captures, principal point and
+turn were wrong by one to two times the standard errors that follow from the scatter of the windows."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigPosterior:
-    """A score of rigs, combined with a prior: normal distributions around 0 of the ten changes (`PARAMETERS`)."""
+    """A score of rigs as log likelihood, with a normal prior of mean 0 for each of the ten changes (`PARAMETERS`)."""
 
     score: RigScore | WindowScore
-    sigmas: FloatArray  # prior standard deviations of the changes, shape (10,); a change with 0 stays 0
+    sigmas: FloatArray  # prior standard deviations of the changes, shape (10,); a change with 0 is fixed at 0
     median_depth: float  # median depth of the scene points [world units]
     correlated: float = 1.0
-    """Number of parts (of `score.slopes`) that show the same things; multiplies the variance of the score's slope."""
+    """Number of parts (rows of `score.slopes`) that show the same things; it multiplies the derivative's variance."""
 
     def maximum(self, change: FloatArray) -> FloatArray:
-        """Return the ten changes that maximise weight * score - sum((change / sigma)^2) / 2 (BFGS from `change`)."""
+        """Return the ten changes at the posterior's maximum: weight * score - sum((change / sigma)^2) / 2 (by BFGS).
+
+        The search starts at `change` (10,).
+        """
         free = self.sigmas > 0.0
         z = change[free] / self.sigmas[free]
         weight, information = self._information(z)
@@ -75,7 +78,7 @@ class RigPosterior:
         return self._full(z + root @ best.x)
 
     def covariance(self, change: FloatArray, stated_share: float = 1.0) -> FloatArray:
-        """Return the ten changes' covariance (10, 10) at a maximum; `stated_share` scales the score's information."""
+        """Return the changes' posterior covariance (10, 10) at a maximum, with `stated_share` of the information."""
         free = self.sigmas > 0.0
         _, information = self._information(change[free] / self.sigmas[free])
         inverse = np.linalg.inv(stated_share * information + np.eye(len(information)))
@@ -93,12 +96,12 @@ class RigPosterior:
         return value, (parts * self.sigmas)[:, self.sigmas > 0.0]
 
     def _information(self, z: FloatArray) -> tuple[float, FloatArray]:
-        """Return the weight of the score and its information matrix, weight * H, for changes z in prior sigmas.
+        """Return the score's weight and its information matrix, weight * H, at the free changes z in units of sigma.
 
-        H is the curvature of the score. With G the scatter of the parts' contributions to the slope, the covariance of
-        the score's maximum is H^-1 G H^-1 (Huber 1967, parts taken as independent). This equals (weight * H)^-1 if
-        weight * G = H. The weight is the median over H's principal directions, because the ratio is unreliable in
-        directions that the images hardly determine.
+        H is the negative Hessian matrix of the score, and G the scatter of its parts' contributions to the gradient. A
+        maximum of the score has the covariance H^-1 G H^-1 (Huber 1967, for independent parts). It is (weight * H)^-1
+        if weight * G = H. The weight is the inverse of the median of the ratio G / H over H's principal directions,
+        because the ratio is unreliable in directions that the images hardly determine.
         """
         camera = self.score.rig.camera
         turn, shift = 1.0 / camera.fl_x, self.median_depth / camera.fl_x
@@ -115,11 +118,11 @@ class RigPosterior:
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Small windows of one photograph, each k points in space, with the functions that temperatures are fitted by."""
+    """Small windows of one photograph, each of k points in space, and the functions that are fitted to temperatures."""
 
     points: FloatArray  # points of all windows, in the visible camera's OpenCV axes, shape (n, 3) [world units]
     index: IntArray  # indices into `points` of each window's points, shape (windows, k)
-    plain: FloatArray  # orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)
+    plain: FloatArray  # orthonormal basis of the weighted planes a + b x + c y of each window, shape (k, 3)
     bright: FloatArray
     """Weighted brightness of every window, orthogonal to the planes and of length 1, shape (windows, k)."""
     weight: FloatArray  # square roots of the weights of a window's points, shape (k,)
@@ -131,17 +134,17 @@ class Windows:
         return self.index[:, self.index.shape[1] // 2]
 
     def chosen(self, keep: npt.NDArray) -> Windows:
-        """Return only the windows that `keep`, a mask or indices, selects."""
+        """Return the windows that the mask or the indices `keep` select."""
         used, index = np.unique(self.index[keep], return_inverse=True)
         index = index.reshape(-1, self.index.shape[1])
         return Windows(self.points[used], index, self.plain, self.bright[keep], self.weight, self.trust[keep])
 
 
 class SmoothThermal:
-    """A thermal image's local contrast, slightly blurred, as a cubic spline that gives values between pixels."""
+    """A thermal image's local contrast, slightly blurred and interpolated by a cubic spline."""
 
     def __init__(self, contrast: FloatImage) -> None:
-        """Fit the spline to local contrasts, shape (height, width) [K]; NaN where unknown."""
+        """Fit the spline to the local contrast (height, width) [K], which is NaN in unknown pixels."""
         bad = ~np.isfinite(contrast)
         # The noise is estimated from second differences along both axes at once (Immerkaer 1996).
         curved = np.abs(ndimage.convolve(contrast.astype(np.float64), _NOISE_KERNEL, mode="nearest"))
@@ -173,7 +176,7 @@ class SmoothThermal:
 
 
 def _place(pixels: FloatArray) -> FloatArray:
-    """Return pixel positions (n, 2) as array rows and columns (2, n); NaN becomes a place outside the image."""
+    """Return pixel positions (n, 2), x and y, as array rows and columns (2, n); NaN becomes a place outside."""
     return np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
 
 
@@ -181,10 +184,10 @@ class WindowScore:
     """Score of a rig: how well brightness explains temperature in small windows of all frames.
 
     A window of about three thermal pixels mostly shows two materials. Its temperatures then are t = a + b x + c y + d p
-    with p the photograph's brightness, blurred as the thermal camera blurs. R2 is the share of the temperature's
-    variance about a + b x + c y that d p explains. The log likelihood of n independent readings is -n / 2 log(1 - R2);
-    a window counts with n = its trust (`Windows.trust`), and `RigPosterior` scales the sum. The gain d is free in every
-    window, so warm may be bright or dark. A window of more than two materials should be left out.
+    with the photograph's brightness p, blurred as by the thermal camera. R2 is the share of the temperature's variance
+    about the plane a + b x + c y that d p explains. The log likelihood of n independent readings is -n / 2 log(1 - R2);
+    n is the window's trust (`Windows.trust`), and `RigPosterior` scales the sum. The gain d is free in every window, so
+    warm things may be bright or dark. Windows with more than two materials should be left out by the caller.
     """
 
     def __init__(self, windows: Sequence[Windows], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:
@@ -196,8 +199,10 @@ class WindowScore:
         self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """Return R2 of every window at the ten changes `change`, one array (windows,) per frame. Windows are moved by
-        `shift_px`, [thermal pixels]; R2 is 0 if a window leaves the image."""
+        """Return R2 of every window at the ten changes `change` (10,), one array (windows,) per frame.
+
+        Projected windows are moved by `shift_px`, x and y [thermal pixels]. R2 is 0 if a window leaves the image.
+        """
         result = []
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points) + shift_px
@@ -206,7 +211,10 @@ class WindowScore:
         return result
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return the score, a mean over windows, and its derivative by `change`, a row per image part, (parts, 10)."""
+        """Return the score (a mean over windows) at `change` (10,), and each image part's share of its derivative.
+
+        The shares have the shape (parts, 10); the derivative is their sum. For the parts see `_BLOCKS`.
+        """
         total, rows, share = 0.0, [np.zeros((0, 10))], 0.5 / max(self.count, 1)
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points)
@@ -229,8 +237,11 @@ class WindowScore:
         return total, np.concatenate(rows)
 
     def _fit(self, windows: Windows, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return each window's weighted temperatures less their plane, (windows, k); the gain d of its brightness,
-        (windows,); and the sum of squares of the former plus a floor for noise, (windows,)."""
+        """Fit each window's `temperature` (of all points) by plane and brightness; R2 is gain^2 / spread.
+
+        Returns the weighted temperatures minus their plane (windows, k), the gain of the brightness (windows,), and the
+        spread (windows,): the sum of squares of the first plus a floor for noise.
+        """
         value = temperature[windows.index] * windows.weight
         value = value - (value @ windows.plain) @ windows.plain.T
         gain = np.einsum("wk,wk->w", windows.bright, value)
@@ -241,15 +252,15 @@ class WindowScore:
 def refine(
     prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray, int] | None:
-    """Improve a rig that is off by about a pixel until the windows of photographs and thermal images agree best.
+    """Return the changes of a rig at which the windows of photographs and thermal images agree best (`WindowScore`).
 
-    The comparison of edges leaves a bias of some tenths of a pixel, because edges in a photograph and in a thermal
-    image differ in strength. Windows with R2 above `_AGREEMENT` do not have this bias; they are chosen anew before each
-    maximisation. Frames show the same things, so `_CORRELATED_FRAMES` count as one in the weight of the images.
+    The search starts at `change` (10,), which may be wrong by about a pixel; `sigmas` (10,) are prior standard
+    deviations. The comparison of edges leaves a bias of some tenths of a pixel, because edges differ in strength in
+    photographs and thermal images. Windows with R2 above `_AGREEMENT` do not have this bias; they are chosen again
+    before each maximisation. Frames show the same things, so `_CORRELATED_FRAMES` frames count as one.
 
-    Returns:
-        The ten changes, their covariance (10, 10) and the number of windows that agree; None if too few windows agree,
-        if hardly more agree than by chance, or if points would move by `_MOST_SHIFT_PX` or more (median).
+    Returns the ten changes, their covariance (10, 10) and the number of windows that agree. Returns None if too few
+    windows agree, if hardly more agree than by chance, or if points would move by `_MOST_SHIFT_PX` or more (median).
     """
     visible, frames = prepared.visible, prepared.frames
     same = rig.camera.fl_x / visible.fl_x  # scale that makes the photograph's pixels as wide as thermal pixels
@@ -319,10 +330,10 @@ def choose_windows(
     window_px: float,
     most: int,
 ) -> Windows:
-    """Return the windows of a photograph with the most contrast.
+    """Return those windows of a photograph whose brightness has the most contrast.
 
     Args:
-        photograph: Brightness, blurred as the thermal camera blurs, shape (height, width).
+        photograph: Brightness, blurred as by the thermal camera, shape (height, width).
         points: Scene point at each pixel in the visible camera's OpenCV axes, shape (height * width, 3).
         usable: True for pixels that a window may contain, shape (height, width).
         trust: Trust in a window whose middle is at each pixel, shape (height * width,).

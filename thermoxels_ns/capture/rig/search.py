@@ -41,15 +41,13 @@ def estimate_rig(
     start: RigEstimate,
     say: Callable[[str], None] = lambda _: None,
 ) -> RigEstimate:
-    """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
+    """Return the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 
-    The scene points of structure from motion give the depth of the photographs' edges. The rig is moved until these
-    edges, projected into the thermal images of all frames, lie on the thermal edges; `refine` then improves it. Frames
-    (in the order they were taken) with fewer than 12 points are left out, and of more than 40 frames an even choice is
-    used. If the images do not determine the rig, the guess `start` is returned, with the reason as explanation.
-
-    Raises:
-        SceneError: A photograph cannot be decoded.
+    The scene points of structure from motion give the depth of the photographs' edges. The rig is changed until these
+    edges, projected into the thermal images of all frames, coincide with the thermal edges; `refine` then improves it.
+    `frames` must be in the order in which they were taken. Frames with fewer than 12 points are left out; of more than
+    40 frames, 40 evenly spaced ones are used. If the images do not determine the rig, the guess `start` is returned,
+    with the reason as explanation. Raises `SceneError` if a photograph cannot be decoded.
     """
 
     def kept(reason: str) -> RigEstimate:
@@ -89,7 +87,7 @@ def estimate_rig(
     covariance = posterior.covariance(change)
 
     def rejection(change: FloatArray, covariance: FloatArray) -> str | None:
-        """Return why a rig is too far from the start or too uncertain; None if it is acceptable."""
+        """Return the reason why a rig is too far from the start or too uncertain; None if it is acceptable."""
         free = sigmas > 0.0
         far = np.abs(change[free]) / sigmas[free]
         if far.max() > _FARTHEST_SIGMAS:
@@ -125,7 +123,7 @@ def estimate_rig(
 
 
 def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
-    """Return the median standard error of where points at the median depth fall, both axes together [pixels]."""
+    """Return the median standard error, both axes together, of the thermal pixels of points at the median depth."""
     camera = prepared.thermal
     grid = np.linspace(0.05, 0.95, 12)
     pixels = np.array(list(product(grid, grid))) * (camera.width, camera.height)
@@ -136,16 +134,16 @@ def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArra
 
 
 def search_coarsely(score: RigScore, sigmas: FloatArray, median_depth: float) -> tuple[float, FloatArray, float]:
-    """Search over focal length, roll and all shifts of the thermal images for the rig whose edges agree best.
+    """Return the rig of the best normalised cross-correlation of edges, over focal length, roll and image shifts.
 
-    A small turn of the thermal camera shifts its image. For one focal length and roll, the edges of each photograph are
-    drawn in thermal pixels, and the thermal edges are compared with them at all shifts: with edge values a drawn and b
-    thermal, and weights w that fall to 0 at the border, the agreement is sum(w Re a* b) / sqrt(sum(w |a|^2)
-    sum(w |b|^2)) over all frames. Shifts, focal lengths and rolls go to 2.5 of the deviations `sigmas` (10,); turn and
-    shift of the lens, at `median_depth` [world units], both shift the image.
+    A small turn of the thermal camera, and a shift of its lens, both shift its image. For each focal length and roll,
+    the photographs' edges are drawn in thermal pixels and compared with the thermal edges at all shifts. With drawn
+    edge values a, thermal edge values b, and weights w that fall to 0 at the image's border, the agreement is
+    sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over all frames. Shifts (of scene points at `median_depth` [world
+    units]), focal lengths and rolls are searched up to 2.5 standard deviations `sigmas` (10,).
 
-    Returns:
-        The best agreement, its ten changes, and the best of thermal edges whose phases are randomised: by chance.
+    Returns the best agreement, its ten changes (10,), and the best agreement by chance: that of thermal edges with
+    randomised phases.
     """
     camera = score.rig.camera
     content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
@@ -184,8 +182,11 @@ def search_coarsely(score: RigScore, sigmas: FloatArray, median_depth: float) ->
 
 
 def _drawn(edges: EdgePoints, rig: RigModel, change: FloatArray, reach: IntArray) -> Float32Array:
-    """Return the sums of edge values in each thermal pixel, real and imaginary parts, (rows, columns, 2), for the rig
-    with the ten changes `change`; the image is widened on all sides by `reach` (x and y) [pixels]."""
+    """Return the sum of edge values in each thermal pixel, real and imaginary parts, shape (rows, columns, 2).
+
+    The rig with the ten changes `change` projects the edges. The image is widened on all sides by `reach`, the numbers
+    of pixels along x and y.
+    """
     columns, rows = np.array([rig.camera.width, rig.camera.height]) + 2 * reach
     x, y = np.floor(np.nan_to_num(rig.project(change, edges.points), nan=-1e6)).astype(np.int64).T + reach[:, None]
     inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)

@@ -1,4 +1,4 @@
-"""Start of the search for a rig, from the metadata of the camera files."""
+"""Guesses the rig from which the search starts, from metadata of the camera files, or reads a given rig."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 
-_MOST_ERROR_PX = 4.0
-"""Scene points with a larger mean reprojection error are not used, [pixels of the photographs]."""
+_MOST_ERROR_PX = 4.0  # scene points with a larger mean reprojection error are ignored, [pixels of the photographs]
 _FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.05, 0.25
 """Standard deviation of the thermal focal length, as a share of it, for each source of the value."""
 _BASELINE_SIGMA_M = 0.1
@@ -29,7 +28,10 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored;
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Return a `RigFrame` for each of the model's frames, given in its order, without points that project badly."""
+    """Return a `RigFrame` for each of `frames`, without scene points of a reprojection error above `_MOST_ERROR_PX`.
+
+    `frames` must be the frames of `model`, in its order.
+    """
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
     for index, frame in enumerate(frames):
@@ -46,10 +48,12 @@ def rig_start(
     field_of_view_deg: float | None = None,
     metres_per_unit: float | None = None,
 ) -> RigEstimate:
-    """Return a guess of the thermal camera and the rig; a known `metres_per_unit` limits the shift of the lenses.
+    """Return a guess of the thermal camera and the rig, with standard deviations.
 
-    The focal length follows from the first that is known: `field_of_view_deg`, the thermal files' focal length, FLIR's
-    alignment of the two pictures, the thermal files' angle of view, the photographs' angle of view.
+    The focal length comes from the first of these that is known: `field_of_view_deg`, the user's horizontal angle of
+    view; the thermal files' focal length; FLIR's alignment of the two pictures; the thermal files' angle of view; the
+    angle of view of the photographs' camera `visible`. If `metres_per_unit` is known, the lenses are taken to be within
+    about 0.1 m of each other; None: their distance is unknown. `thermal_size` is width and height [pixels].
     """
     width, height = thermal_size
     transform = np.eye(4)
@@ -89,9 +93,10 @@ def rig_start(
 
 
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
-    """Read ``thermal_camera`` and ``rig`` of an earlier capture's transforms.json.
+    """Return the rig in an earlier capture's transforms.json (``thermal_camera`` and ``rig``).
 
-    Lengths are converted if both captures have a scale. Raises `ThermoxelsError` for a bad file or another size.
+    Lengths are converted if both captures have a scale; `metres_per_unit` is this capture's (None: it has none). Raises
+    `ThermoxelsError` if the file is bad, or if the thermal image's size there is not `thermal_size` (width, height).
     """
     content: Any = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("thermal_camera"), dict):

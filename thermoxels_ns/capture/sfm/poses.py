@@ -23,18 +23,18 @@ from thermoxels_ns.data.colmap_model import PARAMETERS, camera_to_world, lens_en
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
-_GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
+_GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one (53 degrees of view)
 _JPEG_QUALITY = 95
 _DATABASE, _IMAGES = "features.db", "images"
-MODEL_FOLDER = "model"  # folder, in that of the stage, of COLMAP's model
+MODEL_FOLDER = "model"  # name of the folder of COLMAP's model, in the folder of the stage
 EVAL_INTERVAL = 8
-EXHAUSTIVE_UP_TO = 80  # all pairs are compared up to this number of photographs; time grows with its square
+EXHAUSTIVE_UP_TO = 80  # largest number of photographs of which all pairs are matched; time grows with its square
 _NEIGHBOURS = 8
-"""Beyond it, each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
-`_NEIGHBOURS` places ahead."""
+"""Above `EXHAUSTIVE_UP_TO`, each photograph is matched with the next `_NEIGHBOURS`, and with the photographs that are
+2, 4, 8, ... times `_NEIGHBOURS` places ahead."""
 _ANCHORS = 40
-"""Beyond it, so many photographs, spread over the capture, are also matched with each other, so that a path
-that returns to its start is closed."""
+"""Above `EXHAUSTIVE_UP_TO`, so many photographs, evenly spread over the capture, are also matched with each other, so
+that a path that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
 _FATAL_ONLY = 3
@@ -48,17 +48,15 @@ def find_poses(
     focal_px: float | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
+    """Find lens, poses and points from the photographs of one camera by COLMAP's incremental structure from motion.
 
-    `photographs` maps frame names to files of `size` (width, height), in the order they were taken; `focal_px` is their
-    stated focal length. Results of an interrupted run in `folder` are reused. COLMAP's model of the largest set of
-    photographs that fit is written to `MODEL_FOLDER` of `folder`, with the names that photographs have in the scene.
+    `photographs` maps frame names to files of `size` (width, height), in the order in which they were taken.
+    `focal_px` is their stated focal length (None: a guess). COLMAP's model of the largest set of photographs that fit
+    together is written to `MODEL_FOLDER` in `folder`, with the names that photographs have in the scene.
 
-    On some errors, such as a thread that cannot write, COLMAP says why and aborts; the next run goes on from there.
-
-    Raises:
-        SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
-        ThermoxelsError: COLMAP raised an error.
+    Results of an interrupted run in `folder` are reused. On some errors, such as a thread that cannot write, COLMAP
+    states the reason and aborts the process; the next run continues there. Raises `SceneError` if fewer than 3
+    photographs fit together or a photograph cannot be decoded, and `ThermoxelsError` if COLMAP raised an error.
     """
     import pycolmap
 
@@ -93,8 +91,8 @@ def _reduced(
 ) -> tuple[list[str], tuple[int, int]]:
     """Write photographs for COLMAP, at most `longest` pixels wide and high, into the folder `images`.
 
-    The files have no EXIF, by which COLMAP would turn them. Returns their names, in the order in which the photographs
-    were taken, and their width and height [pixels].
+    Returns the files' names, in the order of `photographs`, and their width and height [pixels]. The files have no EXIF
+    orientation, because COLMAP would turn them by it.
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
@@ -121,7 +119,7 @@ def _too_few(got: int, what: str) -> SceneError:
 
 
 def _map(folder: Path, count: int, seed: int, say: Callable[[str], None]) -> int:
-    """Write the model of the largest group of photographs that fit together; return their number, 0 without a group."""
+    """Write the model of the largest group of photographs that fit together; return their number; no group: 0."""
     import pycolmap
 
     found = 2  # COLMAP does not call next_image for the first pair
@@ -162,7 +160,7 @@ def _map(folder: Path, count: int, seed: int, say: Callable[[str], None]) -> int
 
 
 def scene_names(count: int) -> list[str]:
-    """Return a scene's frame names without suffix; every 8th is for evaluation, but not the first of three or more.
+    """Return names of `count` frames, without suffix. Every 8th from the 5th on evaluates; of 2 to 6, the last but one.
 
     >>> scene_names(5)[3:]
     ['frame_eval_00004', 'frame_train_00005']
@@ -174,10 +172,10 @@ def scene_names(count: int) -> list[str]:
 
 
 def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> SfmModel:
-    """Return the model that `find_poses` wrote to `folder`, from the photographs of frames `names`.
+    """Return the model that `find_poses` wrote to `folder`, at the size of the original photographs.
 
-    `size` is the original photographs' width and height, from which those for COLMAP may have been reduced. Raises
-    `SceneError` for a damaged model.
+    `names` are the names of the frames that `find_poses` got, in its order; `size` is the original photographs' width
+    and height. Raises `SceneError` if the model is damaged.
     """
     try:
         cameras, images, points = read_model(folder / MODEL_FOLDER)
@@ -211,9 +209,9 @@ def read_poses(folder: Path, names: Sequence[str], size: tuple[int, int]) -> Sfm
 
 
 def image_pairs(count: int) -> IntArray:
-    """Return the pairs of photographs to match, sorted, shape (p, 2): indices in order of time, the smaller first.
+    """Return the pairs of `count` photographs to match, sorted, shape (p, 2): indices in order of time, smaller first.
 
-    These are all pairs up to `EXHAUSTIVE_UP_TO` photographs, beyond it neighbours in time and some far pairs.
+    Up to `EXHAUSTIVE_UP_TO` photographs, these are all pairs; above it, neighbours in time and some far pairs.
 
     >>> image_pairs(3).tolist()
     [[0, 1], [0, 2], [1, 2]]
@@ -231,10 +229,10 @@ def image_pairs(count: int) -> IntArray:
 def _find_and_match(
     folder: Path, names: list[str], params: str, settings: CaptureSettings, say: Callable[[str], None]
 ) -> None:
-    """Find features in reduced photographs and match them, adding to what an interrupted run left in the database.
+    """Find features in the reduced photographs, match them, and write both to the database in `folder`.
 
-    `names` are their files in the order in which they were taken; `params` are the lens's parameters as COLMAP writes
-    them, at the size of the reduced photographs; if empty, the focal length is guessed.
+    Results of an interrupted run in the database are kept. `names` are the reduced photographs' files in the order in
+    which they were taken. `params` are the lens's parameters at that size, as COLMAP writes them; empty: guessed.
     """
     import pycolmap
 

@@ -23,20 +23,20 @@ _WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is 
 _LEAST_FIXES = 4
 _MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
 _MARKER_ERROR_PX = 2.0
-"""A marker whose corners miss their rays by more than this (median) counts as moved and is not used, [pixels]."""
+"""A marker is taken to have moved, and ignored, if its corners miss their rays by more than this (median), [pixels]."""
 
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-"""Direction to the upper edge of the upright picture in the stored picture (x right, y up), by EXIF's orientation."""
-_ROLLED_DEG = 2.0  # standard deviation of how level people hold a picture's sides, [degrees]
-_LEAST_COSINE = 0.3  # of up with the mean of the pictures' upward directions: cameras look down by up to 72 degrees
+"""Direction, in the stored picture (x right, y up), to the top of the upright picture, by EXIF's orientation."""
+_ROLLED_DEG = 2.0  # standard deviation of the roll at which people hold a camera, [degrees]
+_LEAST_COSINE = 0.3  # least cosine of up with the pictures' mean upward direction: cameras look down by at most 72 deg
 _BELIEVED_DEG = 5.0  # largest accepted standard error of the common normal of the cameras' level axes, [degrees]
 
 
 def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[SceneScale | None, str]:
-    """Find the scale by fitting the cameras' places, shape (n, 3), to their GPS fixes; None and the reason if it fails.
+    """Return the scale from a fit of the camera `centres` (n, 3) to their GPS fixes, and ""; or None and a reason.
 
     The fit is a similarity by closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard
-    error follows from the residuals of the linearised fit; a relative error above `_WORST_GPS` counts as a failure.
+    error follows from the residuals of the linearised fit; a relative error above `_WORST_GPS` is a failure.
     """
     known = [i for i, fix in enumerate(fixes) if fix is not None]
     if not known:
@@ -66,7 +66,7 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
 
 
 def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
-    """Return how far east, north and above the mean each fix is, (n, 3), [m]; a missing altitude counts as the mean."""
+    """Return each fix's position east, north and above the mean position, (n, 3), [m]; unknown altitudes: the mean."""
     import pycolmap
 
     known = [fix.altitude_m for fix in fixes if fix.altitude_m is not None]
@@ -80,10 +80,12 @@ def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
 def scale_from_markers(
     model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
 ) -> tuple[SceneScale | None, str]:
-    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side; or None and a reason.
+    """Return the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49), and ""; or None and a reason.
 
-    A marker's corners are triangulated from all photographs that show the marker (linear least squares of the rays).
-    Every marker gives four sides; the standard error combines that of the sides' mean with `standard_error_m`.
+    `photographs` are files by frame name. `side_m` is the side of a marker's black square, `standard_error_m` its
+    standard error (None: 0). A marker's corners are triangulated from all photographs that show it (linear least
+    squares of the rays). Each marker gives four sides. The result's standard error combines that of the sides' mean
+    with `standard_error_m`.
     """
     check_positive("marker side", side_m, "Pass the side of the black square in metres.")
     seen: dict[int, list[tuple[int, FloatArray]]] = {}
@@ -124,7 +126,7 @@ def scale_from_markers(
 
 
 def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
-    """Return the scale of the best similarity from model to metres, and each point's residual (n,), [m]."""
+    """Return the scale of the weighted least-squares similarity from model to metres, and its residuals (n,), [m]."""
     share = weight / weight.sum()
     a, b = model - share @ model, metres - share @ metres
     left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
@@ -156,7 +158,10 @@ class Up:
 
 
 def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, Up]:
-    """Return the model of `frames` with z up, y ahead of the cameras and its origin amid the scene points; and up."""
+    """Return the model in axes with z up, y ahead of the cameras and the origin amid the scene points; and up in them.
+
+    `frames` must be the frames of `model`, in its order.
+    """
     up = find_up(model.camera_to_world, [one.gimbal_deg for one in frames], [one.orientation for one in frames])
     ahead = -model.camera_to_world[:, :3, 2].mean(axis=0)
     # The infinite weight turns up to z exactly; ahead then comes as near to y as it can.
@@ -169,12 +174,12 @@ def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, 
 def find_up(
     camera_to_world: FloatArray, gimbal_deg: Sequence[tuple[float, float] | None], orientation: Sequence[int]
 ) -> Up:
-    """Find the direction of up from the pitch and roll that photographs state, else from how cameras are usually held.
+    """Return the direction of up, from the pitch and roll that photographs state, else from level pictures.
 
     A camera with pitch p (0 level, -90 straight down) and roll r against gravity has up at (-sin r cos p, cos r cos p,
     -sin p) in its axes x right, y up, z back. If no photograph states these angles, pictures are assumed to be level:
-    up is normal to the cameras' horizontal axes if these axes differ enough, else the mean of the vertical axes.
-    `gimbal_deg` is pitch and roll per camera [degrees]; `orientation` is EXIF's, 1 to 8, by which the axes are chosen.
+    up is normal to the pictures' horizontal axes if these axes differ enough, else the mean of the vertical axes.
+    `gimbal_deg` is pitch and roll per camera [degrees] or None; EXIF's `orientation`, 1 to 8, decides on these axes.
     """
     rotations = camera_to_world[:, :3, :3]
     measured = [i for i, angles in enumerate(gimbal_deg) if angles is not None]

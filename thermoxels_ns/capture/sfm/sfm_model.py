@@ -1,4 +1,4 @@
-"""Result of structure from motion: one lens, the poses and scene points; and depth interpolated between points."""
+"""Result of structure from motion (one lens, poses and scene points), and depth interpolated between scene points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermoxels_ns.core.camera import Camera
 _NEIGHBOURS = 12
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.9, 0.1
 _ONE_SURFACE = 0.04  # largest scatter of one surface's points about a plane, as a share of their inverse depth
-_SLOPE_RIDGE = 0.1  # keeps a plane's slope small if the points are on a line, or all far away on one side
+_SLOPE_RIDGE = 0.1  # ridge that keeps a plane's slope small if the points are on a line, or all far away on one side
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,8 @@ class SfmModel:
     camera_to_world: FloatArray  # poses, shape (f, 4, 4), camera axes x right, y up, z back, as in transforms.json
     points: FloatArray  # scene points, shape (n, 3), in world units
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    seen: tuple[IntArray, ...]  # indices into `points` of the points that each frame shows, rising
-    errors_px: tuple[FloatArray, ...]
-    """Distances of these points' features from their projections in each frame, [pixels of the photographs]."""
+    seen: tuple[IntArray, ...]  # for each frame, indices into `points` of the points that it shows, rising
+    errors_px: tuple[FloatArray, ...]  # for each frame, reprojection errors of these points [pixels of the photographs]
 
     @property
     def centres(self) -> FloatArray:
@@ -52,9 +51,10 @@ class SfmModel:
 class SparseDepth:
     """Depth of the scene in any direction from one camera, interpolated between the nearest scene points.
 
-    The inverse depth of a plane is linear in the image, so a plane through the points gives the depth of a surface that
-    is seen at a slant. If the points lie on two surfaces, the surface in front counts: edges that both bands show are
-    mostly outlines, and an outline belongs to the surface in front. Single points that lie far too near do not count.
+    The inverse depth of a plane is linear in the image. A linear fit to the points' inverse depths therefore also gives
+    the depth of a slanted surface. If the points are on two surfaces, the surface in front is used: edges that both
+    photograph and thermal image show are mostly outlines, which belong to the surface in front. Single points that are
+    far too near have no influence.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -65,7 +65,7 @@ class SparseDepth:
         self._tree = KDTree(self._places) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return depths (n,) along rays (n, 3) whose z is 1, and distances (n,) at depth 1 to the nearest point."""
+        """Return depths (n,) along rays (n, 3) with z = 1, and distances (n,) at depth 1 to the nearest scene point."""
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
@@ -82,7 +82,10 @@ class SparseDepth:
 
 
 def _plane(offset: FloatArray, inverse: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return inverse depths (n,) at offset 0 of planes fitted to k points each, and the points' scatter (n,)."""
+    """Return inverse depths (n,) at offset 0 of n planes, each fitted to k points, and the points' scatter (n,).
+
+    The points have an `offset` (n, k, 2) in the image at depth 1, an `inverse` depth (n, k) and a `weight` (n, k).
+    """
     reach = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-12
     weight = weight / (1.0 + np.sum((offset / reach) ** 2, axis=2))
     total = weight.sum(axis=1)
