@@ -146,10 +146,8 @@ def identify(path: Path, folder: Path) -> CameraFile:
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:
-    """Return whether a picture's name marks it as thermal: by a last word "t", or by a word such as "thermal".
-
-    Without such a word, or one such as "visible", in the file's name, the nearest folder with one decides.
-    """
+    """Return whether a picture's name marks it as thermal: by a last word "t", or by a word such as "thermal". Without
+    such a word, or one such as "visible", in the file's name, the nearest folder with one decides."""
     words = words_of(path.stem)
     if len(words) > 1 and words[-1] == "t":
         return True

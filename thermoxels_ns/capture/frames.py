@@ -29,7 +29,7 @@ class CaptureFrame:
 
     name: str  # path of the camera's file with the photograph, relative to the capture folder
     photograph: Path  # a picture file that holds the photograph and no thermal image
-    thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN where no temperature is known
+    thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN in pixels without a temperature
     thermal_source: str  # path of the camera's file with the thermal image, relative to the capture folder
     metadata: ThermogramMetadata  # what the thermal file states besides its temperatures
     camera: str | None = None  # maker and model of the thermal camera, or if unknown, of the photograph's camera
@@ -102,7 +102,7 @@ _Size = tuple[int, int]  # width and height, [pixels]
 def _read(
     pair: Pair, number: int, root: Path, folder: Path, options: RadiometryOptions
 ) -> tuple[CaptureFrame, tuple[_Size, _Size]]:
-    """Read pair number `number` and write its files; return the frame, and sizes of photograph and thermal image."""
+    """Read pair number `number` and write its files to `folder`; return the frame, and the sizes of both images."""
     photograph, camera_file = root / pair.photograph, root / pair.thermal
     thermogram = read_thermogram(camera_file, options)
     thermal_focal = None
@@ -142,7 +142,7 @@ def _read(
 
 
 def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[CaptureFrame]]:
-    """Set stuck pixels to NaN in all frames; return their number and the frames."""
+    """Set pixels that are stuck at one value to NaN in the files of all frames; return their number and the frames."""
     some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
     bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
     if not bad.any():

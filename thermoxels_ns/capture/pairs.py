@@ -84,7 +84,7 @@ def search_pairs(
 
 
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
-    """Return pairs of photographs and thermal images, found by four rules in turn: one file, DJI's names, names, time.
+    """Return pairs of photographs and thermal images, by four rules in turn: one file, DJI's names, equal names, time.
 
     Names are compared without words for the kind of image: ``10-58-15-636-visible.jpg`` pairs with
     ``10-58-15-636-radiometric.tiff``. Two files pair by time if each is the other's nearest, at most `time_limit_s`
@@ -122,7 +122,8 @@ _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
 
 
 def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
-    """Return pairs such as DJI_0001_T and DJI_0001_V (or _W); times in the names may differ by up to `_DJI_LATE_S`."""
+    """Return pairs such as DJI_0001_T and DJI_0001_V (or _W), and by path the reasons why other files have no pair.
+    The times in the two names may differ by up to `_DJI_LATE_S`."""
     taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
     for file in (*photographs, *thermal):
         match = _DJI.match(file.path.stem.lower())
@@ -160,7 +161,8 @@ def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
-    """Return pairs of files with equal names (`_shot`). If several files share a name, their `place` must be equal."""
+    """Return pairs of files with equal names (`_shot`), and by path the reasons why other files have no pair. If
+    several files share a name, their folders (`place`) must be equal too."""
 
     def place(file: CameraFile) -> tuple[str, ...]:
         folders = file.path.relative_to(folder).parts[:-1]
@@ -204,6 +206,7 @@ def _shot(stem: str) -> tuple[str, ...]:
 def _by_time(
     photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], limit_s: float, offset_s: float
 ) -> _Found:
+    """Return pairs of files that are close in time, see `find_pairs`, and by path the reasons for all other files."""
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
     photos, thermals = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
     if not photos or not thermals:

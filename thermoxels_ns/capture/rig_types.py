@@ -37,7 +37,7 @@ class RigFrame:
     photograph: npt.NDArray | Path
     """Grey or RGB array of any number type, or the photograph's file; of the visible camera's size or proportions."""
     temperature_c: npt.NDArray | Path
-    """Temperatures [degrees C], shape (height, width), NaN where unknown; or the path of a .npy file of them."""
+    """Temperatures [degrees C], shape (height, width), NaN in unknown pixels; or the path of a .npy file of them."""
     points: FloatArray
     """Scene points that structure from motion saw in this photograph, in the visible camera's OpenCV axes, (n, 3)."""
     point_ids: IntArray  # number of each scene point, equal in all frames that see the point, shape (n,)
@@ -69,7 +69,7 @@ class RigEstimate:
 
     @property
     def turn_error_deg(self) -> float:
-        """Standard error of the rotation about all axes together [degrees]; NaN where the covariance is unknown."""
+        """Standard error of the rotation about all axes together [degrees]; NaN if the covariance is unknown."""
         return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
     def thermal_pose(self, camera_to_world: npt.ArrayLike) -> FloatArray:

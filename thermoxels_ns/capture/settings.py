@@ -17,12 +17,12 @@ class CaptureSettings(RadiometryOptions):
     """All settings of ``thermoxels capture`` except the input and output folders."""
 
     from_stage: StageName | None = None
-    """Find this again, and the rig after the poses. Without it, these two are found again only if input or options
-    changed; all else, which takes seconds, is done each time."""
+    """Stage to run again, even if nothing changed: poses (the rig then follows) or rig. By default, these two are found
+    again only if input or options changed; all else, which takes seconds, is done each time."""
     skip_bad: bool = False
     """Leave out and report files that cannot be read, instead of stopping at the first of them."""
     time_limit_s: float = 1.5
-    """Longest time between the two exposures where a pair is found by time alone, in seconds."""
+    """Longest time between the two exposures of a pair that is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
     """How far the thermal camera's clock is ahead of the photographs' clock, in seconds."""
     lens: LensModel = "SIMPLE_RADIAL"

@@ -108,7 +108,7 @@ class _Scene:
     """Poses (4, 4) fitted to held-out photographs, in input coordinates, by the frame's index in `file.frames`."""
 
     def placed(self, poses: Sequence[FloatArray]) -> torch.Tensor:
-        """Return camera-to-world matrices, (4, 4) in input coordinates, in nerfstudio's world, (n, 3, 4) float32."""
+        """Return `poses` (4, 4) of input coordinates as camera-to-world matrices of nerfstudio's world, (n, 3, 4)."""
         moved = np.stack(poses)[:, :3]
         moved[:, :, 3] = self.scale * (moved[:, :, 3] + self.translation)
         return torch.from_numpy(moved.astype(np.float32))
@@ -256,7 +256,7 @@ class ThermalDataParser(DataParser):
 
 
 def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
-    """Raise `SceneError` if thermal images without a thermal camera differ in size and their photographs do not."""
+    """Raise `SceneError` if photographs of one size have thermal images of several sizes, without thermal cameras."""
     shared = [(f.thermal, f.intrinsics) for f in frames if f.thermal_intrinsics is None and f.thermal is not None]
     sizes: defaultdict[tuple[int, int], Counter[tuple[int, int]]] = defaultdict(Counter)
     for thermal, camera in shared:
@@ -272,10 +272,8 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, float] | None) -> None:
     """Raise `ThermalFileError` for the first file whose median `middles_c` shows that it does not hold degrees Celsius.
-
     With `bounds_c`, the median of such a file is far outside the bounds. Without bounds, it is about 273.15 degrees
-    above the medians of the other files.
-    """
+    above the medians of the other files."""
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
     if bounds_c is None and not usual:
         return
@@ -326,9 +324,7 @@ def survey_thermal_files(
 
 def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) -> Camera:
     """Return the camera of a frame's thermal image, or the photograph's camera if the frame has no thermal image.
-
-    `shapes` holds the shape (h, w) of each thermal image. Raises `SceneError` if the shape does not fit the camera.
-    """
+    `shapes` holds the shape (h, w) of each thermal image. Raises `SceneError` if the shape does not fit the camera."""
     if frame.thermal is None:
         return frame.intrinsics
     height, width = shape = shapes[frame.thermal]
@@ -426,11 +422,9 @@ def split_frames(
 
 
 def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
-    """Return the split by the lists in the json's content `meta`, see `split_frames`.
-
-    If training or evaluation has no list, it gets all frames that the other lists do not name. If only one of val and
-    test has a list, both get its frames.
-    """
+    """Return the split by the lists in the json's content `meta`, see `split_frames`. If training or evaluation has no
+    list, it gets all frames that the other lists do not name. If only one of val and test has a list, both get its
+    frames."""
     position = {Path(name).as_posix(): i for i, name in enumerate(names)}
     found: dict[str, list[int]] = {}
     for side, key in _KEYS.items():

@@ -111,7 +111,7 @@ class ThermalDataset(InputDataset):
         return moved
 
     def get_mask(self, image_idx: int) -> Bool[Tensor, "h w 1"] | None:
-        """Return a mask that is True where the photograph may be used; None if the scene has no masks."""
+        """Return a mask that is True in the usable pixels of the photograph; None if the scene has no masks."""
         if self._dataparser_outputs.mask_filenames is None:
             return None
         path = self._dataparser_outputs.mask_filenames[image_idx]
@@ -164,10 +164,8 @@ class ThermalDataset(InputDataset):
 
 
 def _averaged(values: FloatArray, valid: BoolArray, side: int) -> tuple[FloatArray, BoolArray]:
-    """Return each block's mean of its valid `values` (h, w), and a mask of the blocks with a valid value.
-
-    A block has `side` x `side` pixels. Without a valid value its mean is 0. A last fraction of a block is cut off.
-    """
+    """Return each block's mean of its valid `values` (h, w), and a mask of the blocks with a valid value. A block has
+    `side` x `side` pixels. Without a valid value its mean is 0. A last fraction of a block is cut off."""
     height, width = (length // side for length in values.shape)
 
     def total(pixels: npt.NDArray) -> FloatArray:

@@ -30,9 +30,9 @@ class Layout:
 
     name: LayoutName
     marks: tuple[str, ...]
-    """Signs, of which a folder must have one: files, folders or keys of frames (``frames with KEY``); empty: none."""
+    """Signs, of which a folder must have one: files, folders, keys of frames (``frames with KEY``). Empty: no sign."""
     thermal: tuple[str, ...] = ("thermal",)
-    """Folders of thermal files, the first that exists is used; empty: photographs alone. Stems name the photographs."""
+    """Folders of thermal files with the photographs' stems; the first that exists is used. Empty: photographs only."""
     photographs: tuple[str, ...] = ()
     """Folders of photographs, one of which must exist, if poses are COLMAP's; empty: a json names and poses them."""
 
@@ -122,12 +122,10 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 
 
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the COLMAP model `place` in the form of transforms.json, and the names of images that are left out.
-
-    Images are matched with the photographs in ``folder / root``; images without a clear match (`matched_names`) are
-    left out. Photographs in subfolders val and test are also listed in ``val_filenames`` and ``test_filenames``.
-    Raises `SceneError` if no image has a match.
-    """
+    """Return the COLMAP model `place` in the form of transforms.json, and the names of images that are left out. Images
+    are matched with the photographs in ``folder / root``; images without a clear match (`matched_names`) are left out.
+    Photographs in subfolders val and test are also listed in ``val_filenames`` and ``test_filenames``. Raises
+    `SceneError` if no image has a match."""
     from PIL import Image  # the help of commands does not need it
 
     cameras, images, _ = read_model(place)
@@ -157,12 +155,10 @@ def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, A
 
 
 def _paired(content: dict[str, Any], name: str, alone: bool) -> dict[str, Any]:
-    """Return the content of a ThermalNeRF json, which has a frame per image, with one frame per pair.
-
-    The i-th photograph's partner is the thermal image with its stem, else the i-th thermal image. With `alone`, there
-    are no pairs: the frames are the photographs. `name` names the json in messages. Raises `SceneError` if there are
-    not as many thermal images as photographs (but with `alone`).
-    """
+    """Return the content of a ThermalNeRF json, which has a frame per image, with one frame per pair. The i-th
+    photograph's partner is the thermal image with its stem, else the i-th thermal image. With `alone`, there are no
+    pairs: the frames are the photographs. `name` names the json in messages. Raises `SceneError` if there are not as
+    many thermal images as photographs (but with `alone`)."""
     frames = content["frames"]
     if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
         return content  # the reader of frames says which is wrong

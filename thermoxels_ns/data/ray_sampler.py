@@ -213,10 +213,8 @@ class CameraRays:
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
         """Return fields of `RayBundle` by name for the rays through the centres of the pixels numbered `pixels` (n,).
-
         They are origins (n, 3), unit directions (n, 3), camera_indices (n, 1), and pixel_area (n, 1), the area at
-        distance 1 that a pixel in the middle of the image covers. `pixels` must be on `self.device`.
-        """
+        distance 1 that a pixel in the middle of the image covers. `pixels` must be on `self.device`."""
         image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
         place = pixels + self._table_shift.index_select(0, image)
         camera_axes = self._directions.index_select(0, place)[..., None]
@@ -246,10 +244,8 @@ class CameraRays:
         return torch.cat(numbers).to(self.device)
 
     def _camera_axes(self, index: int) -> Float[Tensor, "pixels 3"]:
-        """Return unit ray directions in camera axes for all pixels of camera `index`, (pixels, 3).
-
-        Raises `SceneError` if the lens distortion cannot be undone in a pixel.
-        """
+        """Return unit ray directions in camera axes for all pixels of camera `index`, (pixels, 3). Raises `SceneError`
+        if the lens distortion cannot be undone in a pixel."""
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]
         width = int(self.widths[index])

@@ -21,12 +21,13 @@ Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
 _TAIL = 0.5
 """Points left outside the box at either end of an axis, [%], because some are wrong. It was chosen on a synthetic block
-before far walls, with 0.7 % wrong depths: 0.1 makes its box 1.5 times as long. A mast of fewer points has `_MARGIN`."""
+before far walls, with 0.7 % wrong depths: 0.1 makes its box 1.5 times as long. A mast of fewer points is inside the box
+only because of `_MARGIN`."""
 _MARGIN = 0.08  # Width added on every side, relative to the longest side of the box
 _ROUNDED = 2.0**-8  # Corners are rounded to this share of the longest side, or less
-_MOST_POINTS = 20_000  # About as many of the points are used
-_MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked up
-_PROBES = 8  # Probe points along each side of a box for which no points are known
+_MOST_POINTS = 20_000  # Number of points, evenly chosen, to which larger sets are reduced (about)
+_MOST_PHOTOGRAPHS = 64  # Largest number of photographs into which points are projected
+_PROBES = 8  # Grid points along each side of a box in which no scene points are known
 _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are found, and pixels along their longer side; this takes some seconds."""
 _FEWEST_POINTS = 10  # Sparse points in view that a box needs
@@ -148,7 +149,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
-    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view."""
+    """Return the depth of each point in each photograph, (photographs, points); NaN for a point that is not in view."""
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
@@ -203,7 +204,7 @@ def _checked(corners: Any, name: str) -> Box:
 
 
 def _read_ply(path: Path) -> FloatArray:
-    """Read the points (n, 3) of a .ply file (ASCII or binary), which is in the coordinates of the json."""
+    """Return the points (n, 3) of a .ply file (ASCII or binary), in the coordinates of the json."""
     import trimesh  # slow to import and only needed here
 
     if not path.is_file():

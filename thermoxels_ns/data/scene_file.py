@@ -34,7 +34,7 @@ class Frame:
     mask: Path | None  # image that is white in pixels of the photograph that may be used; None: no mask
     pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes (x right, y up, z back), input coordinates
     intrinsics: Camera  # camera of the photograph
-    thermal_pose: FloatArray | None  # pose of the thermal camera, as `pose`; None: the photograph's
+    thermal_pose: FloatArray | None  # pose of the thermal camera, in the form of `pose`; None: the photograph's pose
     thermal_intrinsics: Camera | None
     """Camera of the thermal image; None: the photograph's, scaled to the thermal image's resolution."""
 

@@ -37,7 +37,7 @@ class SparseTracks:
     source: str = "tracks"  # folder of the COLMAP model
 
     def well_seen(self) -> FloatArray:
-        """Return the points (m, 3) that `FEWEST_VIEWS` photographs see with an error of at most `MOST_ERROR_PX`."""
+        """Return the points (m, 3) that `FEWEST_VIEWS` or more photographs see, with errors up to `MOST_ERROR_PX`."""
         views = np.bincount(np.concatenate([*self.seen.values()]), minlength=len(self.points))
         return self.points[(views >= FEWEST_VIEWS) & (self.point_error_px <= MOST_ERROR_PX)]
 
@@ -133,10 +133,8 @@ def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
-    """Return, for each of `count` points, twice the largest angle between its directions and their mean [radians].
-
-    The unit `directions` (n, 3) belong to the points with the indices `point` (n,). A point without directions gets 0.
-    """
+    """Return, for each of `count` points, twice the largest angle between its directions and their mean [radians]. The
+    unit `directions` (n, 3) belong to the points with the indices `point` (n,). A point without directions gets 0."""
     mean = np.stack([np.bincount(point, directions[:, axis], count) for axis in range(3)], axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     off = np.zeros(count)

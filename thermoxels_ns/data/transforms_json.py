@@ -58,10 +58,8 @@ def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
 
 def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
     """Return a frame's camera from the json: each value is that of its `entry`, else that of the scene's `meta`.
-
     Missing w and h are the width and height of the file `image`; None: no file to compare with. Raises `SceneError`,
-    which names `where`, for values that are missing, that no lens has, or that do not fit `image`.
-    """
+    which names `where`, for values that are missing, that no lens has, or that do not fit `image`."""
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")

@@ -31,7 +31,7 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
 TOLERANCE_VOXELS = 1.5  # A point agrees with the other surface if it is at most this far from that surface, [voxels]
 DEPTH_TOLERANCE = 0.02  # A depth is off if it differs from the true depth by more than this share of the true depth
-COMMON_RESOLUTION = 128  # `TOLERANCE_VOXELS` of `fscore_128` are of voxels of which so many span the exact box
+COMMON_RESOLUTION = 128  # Voxels along the exact box's longest side; their size sets the tolerance of `fscore_128`
 
 _SURFACE_POINTS = 20_000
 _PER_SIDE = 2  # Sample points along each side of a voxel's face
@@ -58,10 +58,8 @@ class SurfaceScore:
 
 def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
     """Return sample points on the faces between solid `cells` and empty cells, `_PER_SIDE` squared on each face.
-
     Returns the points (n, 3) [corner indices], the index of the empty cell in front of each point (n, 3), and a mask
-    (n,), True if that empty cell is outside the lattice or outside the region `within` (a mask like `cells`).
-    """
+    (n,), True if that empty cell is outside the lattice or outside the region `within` (a mask like `cells`)."""
     steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
     for axis in range(3):
         rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)

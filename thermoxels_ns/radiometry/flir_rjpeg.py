@@ -130,11 +130,9 @@ def read_flir_jpeg(path: Path) -> FlirImage:
 
 
 def _records(fff: bytes) -> dict[int, bytes]:
-    """Return the bytes of the records that this module reads, by record type, from the FFF block of an R-JPEG.
-
-    The caller must have joined the block from the APP1 segments. Layout and field offsets are from ExifTool's public
-    tables of FLIR tags. Raises `ValueError` if the block is damaged.
-    """
+    """Return the bytes of the records that this module reads, by record type, from the FFF block of an R-JPEG. The
+    caller must have joined the block from the APP1 segments. Layout and field offsets are from ExifTool's public tables
+    of FLIR tags. Raises `ValueError` or `struct.error` if the block is damaged."""
     version = {order: struct.unpack_from(f"{order}I", fff, 20)[0] for order in "><"}
     order = next((order for order, number in version.items() if 100 <= number < 200), None)
     if fff[:4] not in (b"FFF\0", b"AFF\0") or order is None:
@@ -152,11 +150,9 @@ def _records(fff: bytes) -> dict[int, bytes]:
 
 
 def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
-    """Return the raw counts (height, width) of a record that holds them as plain numbers or as a PNG.
-
-    Most cameras write the PNG's 16-bit numbers in the wrong byte order, and no file states the order. A thermal image
-    is smooth, and with swapped bytes it is noise: the order with the smaller differences between neighbours is taken.
-    """
+    """Return the raw counts (height, width) of a record that holds them as plain numbers or as a PNG. Most cameras
+    write the PNG's 16-bit numbers in the wrong byte order, and no file states the order. A thermal image is smooth, and
+    with swapped bytes it is noise: the order with the smaller differences between neighbours is taken."""
     record, data = _Record.marked(content), content[_IMAGE_HEADER_BYTES:]
     width, height = (int(number) for number in record.numbers(2, "HH"))
     check_thermal_size(path, width, height)

@@ -240,7 +240,7 @@ class RadiometricModel:
         return kelvin_to_celsius(self.sensor.temperature_k(object_signal))
 
     def _weights(self) -> tuple[float, float]:
-        """Return the weight of S(T_object) in S_total, which is refused if 0, and the sum of all other terms."""
+        """Return S(T_object)'s weight in S_total and the sum of the other terms; raise an error if that is 0."""
         given = self.conditions
         air_c = 0.0 if given.air_c is None else given.air_c
         tau = self.air.transmission(given.distance_m, air_c, given.relative_humidity)

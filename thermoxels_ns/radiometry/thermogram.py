@@ -68,7 +68,7 @@ class ThermogramMetadata:
 class Thermogram:
     """One thermal image in degrees C, with the metadata of its file."""
 
-    temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where masked
+    temperature_c: Float32Array  # shape (height, width), [degrees C], NaN in masked pixels
     metadata: ThermogramMetadata
 
 
@@ -115,9 +115,7 @@ def _read_stored(
     path: Path, found: ThermalFormat, options: RadiometryOptions
 ) -> tuple[Float32Array, ThermogramMetadata]:
     """Return temperatures [degrees C] and metadata of a file of apparent temperatures, or of counts linear in them.
-
-    `found` is the file's format. Temperatures are corrected for the conditions in `options`.
-    """
+    `found` is the file's format. Temperatures are corrected for the conditions in `options`."""
     camera, picture = None, found in ("TIFF", "PNG")
     unit = None if options.camera is None else COUNT_SCALES[options.camera][0]
     if options.celsius_per_count is not None and options.celsius_offset is not None:

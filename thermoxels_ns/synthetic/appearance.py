@@ -24,7 +24,7 @@ class SolidTexture:
     """A texture in space: a random colour deviation at every point, which does not repeat within the box.
 
     The texture is the sum of random values on three cubic lattices, interpolated with a smoothstep. The spacing of the
-    finest lattice is two voxels where 64 voxels span the box's longest side.
+    finest lattice is 2 / 64 of the box's longest side.
     """
 
     def __init__(self, box: Box, seed: int) -> None:

@@ -233,7 +233,7 @@ def courtyard() -> SyntheticScene:
     x, y, thick, top = (-0.75, 0.25, 1.25, 2.25), -2.3, 0.28, 2.4
     pergola: list[Box] = [((at, y, 0.0), (at + thick, y + thick, top)) for at in x]
     pergola.append(((west[1][0], y, top), (x[-1] + thick, y + thick, top + thick)))
-    # A free-standing wall, 1.8 voxels thick where 128 voxels span the scene.
+    # A free-standing wall. It is 1.8 voxels thick if 128 voxels span the scene.
     garden_wall: Box = ((1.2, -4.4, 0.0), (4.8, -4.24, 1.6))
     flue: Box = ((3.9, 0.3, 1.2), (4.25, 0.65, 1.55))
     plan = _plan(
@@ -436,10 +436,8 @@ def street() -> SyntheticScene:
 
 
 def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
-    """Return a scene of a house front, 10.4 m wide and 7.6 m high, with three lines of cameras along it.
-
-    `mirror` is the panes' share of mirrored light; `sky` is one colour, None: a blue sky; `railing`: add a balcony.
-    """
+    """Return a scene of a house front, 10.4 m wide and 7.6 m high, with three lines of cameras along it. `mirror` is
+    the panes' share of mirrored light; `sky` is one colour, None: a blue sky; `railing`: add a balcony."""
     plan = Plan(np.random.default_rng(8))
     paints = (
         wall,

@@ -95,7 +95,7 @@ class DrawnFlaws:
         return given
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
-        """Return the lowest and highest reading [C] that drift and noise make of `lowest_c` and `highest_c` [C]."""
+        """Return lowest and highest reading [C] for `lowest_c` to `highest_c` [C], with drift and 6 sigma of noise."""
         margin = _NOISE_SIGMAS * self.flaws.noise_k
         low, high = min(float(self.drifts_k.min()), 0.0), max(float(self.drifts_k.max()), 0.0)
         return lowest_c + (low - margin), highest_c + (high + margin)

@@ -200,10 +200,8 @@ def _windows(
     pier: float = _PIER,
 ) -> list[tuple[Range, Range]]:
     """Cut a grid of equal openings with panes into a wall, except for some at random; return each opening's extents.
-
     The openings lie within `along` (less `_CORNER` at both ends) and `height`; extents are along the wall and in z.
-    `columns` and `rows` of the grid follow from the wall's size if None. `pier` is the least wall beside an opening.
-    """
+    `columns` and `rows` of the grid follow from the wall's size if None. `pier` is the least wall beside an opening."""
     a0, a1 = along[0] + _CORNER, along[1] - _CORNER
     z0, z1 = height
     room = 2.0 * pier + _OPENING
@@ -326,9 +324,7 @@ def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
 
 def _lying_pipe(plan: Plan, sign: int, near: float, half: float, high: float) -> None:
     """Add a level pipe on two posts along a wall of half length `half` and height `high`, on its side `sign` (1: +y).
-
-    The pipe's near side has the distance `near` from the wall's middle plane.
-    """
+    The pipe's near side has the distance `near` from the wall's middle plane."""
     u = plan.u
     radius, length, z = u(2.2, 5), u(1.1, 1.8) * half, u(0.25, 0.8) * high
     x, y = u(-1, 1) * (half - 0.5 * length), sign * (near + radius)

@@ -160,9 +160,7 @@ class Plan:
 
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
         """Return, for each surface point (n, 3), the paint index of the last piece that contains it, (n,); none: 0.
-
-        Each point is first moved inwards by 0.01 `unit`, against its outward unit normal (n, 3).
-        """
+        Each point is first moved inwards by 0.01 `unit`, against its outward unit normal (n, 3)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
         x, y, z = np.ascontiguousarray(inner.T)
@@ -178,7 +176,7 @@ class Plan:
     def warmth(self, points: npt.ArrayLike) -> FloatArray:
         """Return the warmth at points (n, 3), shape (n,). It is continuous in space.
 
-        It is the weighted mean of the pieces' warmths, with the weights exp(-distance / 2 `unit`): touching pieces
+        It is the weighted mean of the pieces' warmths, with the weights exp(-distance / (2 `unit`)): touching pieces
         blend as by heat conduction. Glows are then blended in.
         """
         points = np.asarray(points, dtype=np.float64)

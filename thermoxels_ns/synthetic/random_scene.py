@@ -147,10 +147,8 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Return the textured scene of a plan in metres; `rest` are further fields of `SyntheticScene`.
-
-    `solid` must be the plan's solid; None: it is made here.
-    """
+    """Return the textured scene of a plan in metres; `rest` are further fields of `SyntheticScene`. `solid` must be the
+    plan's solid; None: it is made here."""
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
@@ -189,7 +187,7 @@ def _degrees(value: float) -> float:
 
 
 _PICTURE_ASPECT = 0.75
-_RIM = 0.95  # everything must show within this share of the picture's width and height
+_RIM = 0.95  # all boxes must be in view within this share of the picture's width and height
 _AZIMUTHS = 73
 _AIMS = 9
 _ELEVATIONS_DEG = {2: ((10.0, 20.0), (38.0, 50.0)), 3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0))}
@@ -220,12 +218,10 @@ def random_rings(
 
 
 def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
-    """Return the least distance from the origin at which all cameras of an arc have all points (n, 3) in view.
-
-    The cameras look at the origin from the angle `elevation` [radians]. A camera has a point in view if the point's
-    offsets from the view axis, sideways and upwards, are at most the half width and half height of the view at the
-    point's depth: beside <= half (distance - nearer), and likewise above.
-    """
+    """Return the least distance from the origin at which all cameras of an arc have all points (n, 3) in view. The
+    cameras look at the origin from the angle `elevation` [radians]. A camera has a point in view if the point's offsets
+    from the view axis, sideways and upwards, are at most the half width and half height of the view at the point's
+    depth: beside <= half (distance - nearer), and likewise above."""
     azimuth = np.radians(arc_deg[0] + arc_deg[1] * np.linspace(0.0, 1.0, _AZIMUTHS))
     back = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(_AZIMUTHS, math.tan(elevation))], axis=1)
     back *= math.cos(elevation)
@@ -303,7 +299,7 @@ def with_room(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
 
 def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float], float, float, float]:
-    """Return an empty plan, the scene's middle (x, y) and size, a radius beyond its cameras, and the floor's z [m]."""
+    """Return an empty plan, the scene's middle (x, y) and size, a radius around its cameras, and the floor's z [m]."""
     lo, hi = np.array(scene.scene_box)
     size, middle = scene.size, 0.5 * (lo + hi)
     cameras = scene.poses(48, 6)[0][:, :3, 3]

@@ -80,10 +80,8 @@ def visible_surface_points(
 def _look(
     scene: SyntheticScene, origins: FloatArray, directions: FloatArray, mirrors: bool = True
 ) -> tuple[Float32Array, FloatArray]:
-    """Return colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one origin each (n, 3).
-
-    With `mirrors`, mirroring surfaces blend in the colour along the reflected ray. Reflected rays meet no more mirrors.
-    """
+    """Return colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one origin each (n, 3). With
+    `mirrors`, mirroring surfaces blend in the colour along the reflected ray. Reflected rays meet no more mirrors."""
     rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
     solids = [body.solid for body in scene.bodies]
     for start in range(0, len(directions), _RAYS_AT_ONCE):

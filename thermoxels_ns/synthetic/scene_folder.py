@@ -39,8 +39,8 @@ _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
 }
 """Folders of photographs ({}: train or test), of thermal images and of the COLMAP model ("": none) in each layout."""
 _BOUNDS, _JSON = "temperature_bounds.json", "transforms.json"
-_SAME_POINT = 1e-6  # share of the way to a point by which rounding may be off
-_POINTS_PER_VIEW = 50  # points of the COLMAP model that are drawn in each view
+_SAME_POINT = 1e-6  # tolerance for rounding, as a share of the distance from the camera to a point
+_POINTS_PER_VIEW = 50  # number of random pixels in each view whose surface points are put into the COLMAP model
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
@@ -146,10 +146,8 @@ def write_scene(
 
 def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
     """Return frames as ThermalNeRF has them: all photographs, then all thermal images, each with its camera's entries.
-
-    `camera` and `own` are the entries of photographs' and thermal camera. The former, but for camera_model, are removed
-    from `camera` in place.
-    """
+    `camera` and `own` are the entries of the photographs' and of the thermal camera. All keys of `own` except
+    camera_model are removed from `camera` in place."""
     poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
     kept = {key: camera.pop(key) for key in own if key != "camera_model"}
     seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
@@ -163,11 +161,9 @@ def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any
 def _write_colmap_model(
     folder: Path, scene: SyntheticScene, poses: FloatArray, frames: _Frames, camera: Camera, given: Camera, seed: int
 ) -> None:
-    """Write a COLMAP model as text into `folder`: random surface points, and the photographs that see each point.
-
-    The true `poses` (n, 4, 4) and `camera` decide what is seen. The written poses are those in `frames` and the written
-    lens is `given`; both may have errors.
-    """
+    """Write a COLMAP model as text into `folder`: random surface points, and the photographs that see each point. The
+    true `poses` (n, 4, 4) and `camera` decide what is seen. The written poses are those in `frames` and the written
+    lens is `given`; both may have errors."""
     generator, points = np.random.default_rng(seed), []
     for pose in poses:
         rays = camera.directions(pose).reshape(-1, 3)
@@ -222,11 +218,9 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
 
 
 def _thermal_camera(scene: SyntheticScene, width: int, height: int, own: bool) -> tuple[Camera, FloatArray]:
-    """Return the camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
-
-    With `own`, the thermal camera has half as many columns, a slightly different field of view and an off-centre
-    principal point; otherwise it is the photographs' camera.
-    """
+    """Return the camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera. With `own`,
+    the thermal camera has half as many columns, a slightly different field of view and an off-centre principal point;
+    otherwise it is the photographs' camera."""
     sizes = {"width": width, "height": height}
     check_ranges("--", {name: (value, 1, _MOST_SIDE, f"1 to {_MOST_SIDE} pixels") for name, value in sizes.items()})
     offset = np.eye(4)

@@ -44,7 +44,7 @@ class CameraRing:
     target: Vector  # point at which all cameras look, on the axis of the circle [m]
     radius_m: float  # horizontal distance from the axis [m]
     height_m: float  # z of the cameras [m]
-    start_deg: float = 0.0  # azimuth where the arc begins, counted from x towards y [degrees]
+    start_deg: float = 0.0  # azimuth of the arc's begin, counted from x towards y [degrees]
     span_deg: float = 360.0  # length of the arc [degrees]; 360 closes the ring
 
     @property
@@ -74,7 +74,7 @@ class CameraWalk:
 
     ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
     aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
-    closed: bool = False  # the last camera is no neighbour of the first
+    closed: bool = False  # False: the last camera is no neighbour of the first
 
     def pose(self, share: float) -> FloatArray:
         """Return the camera-to-world pose (4, 4) at `share` of the line, 0 (begin) to 1 (end), see `look_at`."""
@@ -127,8 +127,8 @@ class SyntheticScene(Body):
     scene_box: Box  # lower and upper corner of the box to reconstruct, which contains the solid
     temperature_bounds_c: tuple[float, float]  # bounds of the temperatures of all surfaces and of the background
     background_rgb: RgbFunction  # function of unit directions (n, 3), away from the camera, to colours (n, 3)
-    background_temperature_c: DegreesFunction  # function of such directions to temperatures (n,) [C]
-    rings: tuple[CameraRing | CameraWalk, ...]  # where cameras stand
+    background_temperature_c: DegreesFunction  # function of unit directions (n, 3) to temperatures (n,) [C]
+    rings: tuple[CameraRing | CameraWalk, ...]  # circles, arcs and lines on which cameras stand
     focal_share: float  # focal length over the image width, for a 4:3 image
     around: Body | None = None
     """Surroundings, such as houses opposite, that photographs show and that meshes leave out; None: no surroundings."""

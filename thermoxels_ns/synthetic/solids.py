@@ -180,10 +180,8 @@ class BoxSolid(Solid):
 
     def _find_rectangles(self) -> None:
         """Set `_lo`, `_hi`, `_normals` and `_planes` to m large rectangles that cover the surface without overlap.
-
         `_lo` and `_hi` are lower and upper corners [m], `_normals` outward unit normals, each of shape (m, 3). Each of
-        `_planes` holds the axis and sign of its normal, its coordinate [m], and the indices of its rectangles.
-        """
+        `_planes` holds the axis and sign of its normal, its coordinate [m], and the indices of its rectangles."""
         filled, found = np.pad(self._cells, 1).astype(np.int8), []
         self._planes: list[tuple[int, int, float, range]] = []
         for axis in range(3):
@@ -314,10 +312,8 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
 
 def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
     """Return the distances (n,) at which rays enter and leave a circle or ball around the origin; a miss: inf and -inf.
-
     The rays run from `start` along `way`, both (n, 2) or (n, 3); distances are in lengths of `way`. The half chord is
-    computed at the foot of the perpendicular, so that it keeps its digits for a far start.
-    """
+    computed at the foot of the perpendicular, so that it keeps its digits for a far start."""
     squared = np.einsum("ij,ij->i", way, way)
     # A ray along a cylinder's axis, or tilted from the axis by less than rounding, is inside for ever or never.
     along = squared <= _PARALLEL_SINE_SQUARED

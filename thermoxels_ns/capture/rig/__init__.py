@@ -1,1 +1,1 @@
-"""Finds where the thermal camera sits beside the visible camera, and how the thermal camera's readings drift."""
+"""Finds the rig (the thermal lens and its pose relative to the visible camera), and the drift of thermal readings."""

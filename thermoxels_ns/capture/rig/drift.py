@@ -89,9 +89,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
 
 def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArray]:
     """Return the differences of pairs of readings of one point: point numbers (n,), matrix, and differences (n,) [K].
-
-    The matrix (n, frames + radial terms), times the offsets and radial coefficients, is what drift adds to them.
-    """
+    The matrix (n, frames + radial terms), times the offsets and radial coefficients, is what drift adds to them."""
     pairs = []
     for lag in range(1, _MOST_LAG + 1):
         first = np.flatnonzero(samples.point[lag:] == samples.point[:-lag])

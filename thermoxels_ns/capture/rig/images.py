@@ -25,7 +25,7 @@ _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
 """Distance from an edge to the nearest scene point, both at depth 1, beyond which the edge's depth is unknown."""
-SURE_DISTANCE = 0.01  # distance from an edge to the nearest scene point, both at depth 1, with half the weight
+SURE_DISTANCE = 0.01  # distance from an edge to the nearest scene point, both at depth 1, at which its trust is 1/2
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
@@ -111,7 +111,7 @@ class PreparedFrames:
     frames: tuple[PreparedFrame, ...]
     visible: Camera
     thermal: Camera
-    median_depth: float  # of all scene points [world units]
+    median_depth: float  # median depth of all scene points [world units]
 
     def sizes(self) -> list[tuple[int, int]]:
         """Return the sizes (width, height) at which thermal images are compared, halvings of the full size, rising."""
@@ -121,9 +121,7 @@ class PreparedFrames:
 
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
         """Return the `RigScore` for thermal images of `size` (width, height), with weights at the ten changes `change`.
-
-        `blur_px` is the standard deviation of the edges' blur [thermal pixels at that size].
-        """
+        `blur_px` is the standard deviation of the edges' blur [thermal pixels at that size]."""
         level = rig.at_size(*size)
         edges, thermal = [], []
         for frame in self.frames:
@@ -134,11 +132,9 @@ class PreparedFrames:
 
     def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
         """Return the strongest edges of a frame's photograph, reduced to pixels a little smaller than thermal pixels.
-
         `level` is the rig at the thermal images' size. Left out are edges that it projects, with the changes `change`,
-        far outside the thermal image, and edges of unknown depth.
-        """
-        # With pixels of the same size, the score would prefer whole-pixel shifts, where interpolation blurs nothing.
+        far outside the thermal image, and edges of unknown depth."""
+        # With pixels of the same size, the score would prefer whole-pixel shifts, as interpolation then blurs nothing.
         height, width = frame.grey.shape
         same = level.camera.fl_x / self.visible.resized(width, height).fl_x
         scale = min(_FINER * same, 1.0)

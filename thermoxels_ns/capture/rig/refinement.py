@@ -59,10 +59,8 @@ class RigPosterior:
     """Number of parts (rows of `score.slopes`) that show the same things; it multiplies the derivative's variance."""
 
     def maximum(self, change: FloatArray) -> FloatArray:
-        """Return the ten changes at the posterior's maximum: weight * score - sum((change / sigma)^2) / 2 (by BFGS).
-
-        The search starts at `change` (10,).
-        """
+        """Return the ten changes that maximise the log posterior weight * score - sum((change / sigma)^2) / 2 (BFGS).
+        The search starts at `change` (10,); `_information` finds the weight there."""
         free = self.sigmas > 0.0
         z = change[free] / self.sigmas[free]
         weight, information = self._information(z)
@@ -199,10 +197,8 @@ class WindowScore:
         self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """Return R2 of every window at the ten changes `change` (10,), one array (windows,) per frame.
-
-        Projected windows are moved by `shift_px`, x and y [thermal pixels]. R2 is 0 if a window leaves the image.
-        """
+        """Return R2 of every window at the ten changes `change` (10,), one array (windows,) per frame. Projected
+        windows are moved by `shift_px`, x and y [thermal pixels]. R2 is 0 if a window leaves the image."""
         result = []
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points) + shift_px
@@ -211,10 +207,8 @@ class WindowScore:
         return result
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return the score (a mean over windows) at `change` (10,), and each image part's share of its derivative.
-
-        The shares have the shape (parts, 10); the derivative is their sum. For the parts see `_BLOCKS`.
-        """
+        """Return the score (a mean over windows) at `change` (10,), and each image part's share of its derivative. The
+        shares have the shape (parts, 10); the derivative is their sum. For the parts see `_BLOCKS`."""
         total, rows, share = 0.0, [np.zeros((0, 10))], 0.5 / max(self.count, 1)
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points)
@@ -237,11 +231,9 @@ class WindowScore:
         return total, np.concatenate(rows)
 
     def _fit(self, windows: Windows, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit each window's `temperature` (of all points) by plane and brightness; R2 is gain^2 / spread.
-
-        Returns the weighted temperatures minus their plane (windows, k), the gain of the brightness (windows,), and the
-        spread (windows,): the sum of squares of the first plus a floor for noise.
-        """
+        """Fit each window's `temperature` (of all points) by plane and brightness; R2 is gain^2 / spread. Returns the
+        weighted temperatures minus their plane (windows, k), the gain of the brightness (windows,), and the spread
+        (windows,): the sum of squares of the first plus a floor for noise."""
         value = temperature[windows.index] * windows.weight
         value = value - (value @ windows.plain) @ windows.plain.T
         gain = np.einsum("wk,wk->w", windows.bright, value)

@@ -30,8 +30,8 @@ _REACH_SIGMAS, _LARGEST_REACH_SHARE = 2.5, 0.75
 _STEP_PX = 2.5
 _COARSE_FRAMES = 16
 _LEAST_POWER = 0.1
-"""A shift of the images does not win where they show less of the photographs' edges than this share of the most that
-any shift shows."""
+"""Floor of sum(w |a|^2) (`search_coarsely`), as a share of its maximum over all shifts. The floor prevents that a shift
+at which the image shows few of the photographs' edges is chosen."""
 _CHANCE_DRAWS = 3
 
 
@@ -123,7 +123,10 @@ def estimate_rig(
 
 
 def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
-    """Return the median standard error, both axes together, of the thermal pixels of points at the median depth."""
+    """Return the median standard error [pixels], both axes together, of projections of points at the median depth.
+
+    `covariance` (10, 10) is that of the ten changes at `change`.
+    """
     camera = prepared.thermal
     grid = np.linspace(0.05, 0.95, 12)
     pixels = np.array(list(product(grid, grid))) * (camera.width, camera.height)
@@ -182,11 +185,9 @@ def search_coarsely(score: RigScore, sigmas: FloatArray, median_depth: float) ->
 
 
 def _drawn(edges: EdgePoints, rig: RigModel, change: FloatArray, reach: IntArray) -> Float32Array:
-    """Return the sum of edge values in each thermal pixel, real and imaginary parts, shape (rows, columns, 2).
-
-    The rig with the ten changes `change` projects the edges. The image is widened on all sides by `reach`, the numbers
-    of pixels along x and y.
-    """
+    """Return the sum of edge values in each thermal pixel, real and imaginary parts, shape (rows, columns, 2). The rig
+    with the ten changes `change` projects the edges. The image is widened on all sides by `reach`, the numbers of
+    pixels along x and y."""
     columns, rows = np.array([rig.camera.width, rig.camera.height]) + 2 * reach
     x, y = np.floor(np.nan_to_num(rig.project(change, edges.points), nan=-1e6)).astype(np.int64).T + reach[:, None]
     inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)

@@ -29,9 +29,7 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored;
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
     """Return a `RigFrame` for each of `frames`, without scene points of a reprojection error above `_MOST_ERROR_PX`.
-
-    `frames` must be the frames of `model`, in its order.
-    """
+    `frames` must be the frames of `model`, in its order."""
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
     for index, frame in enumerate(frames):

@@ -89,11 +89,9 @@ def find_poses(
 def _reduced(
     photographs: Mapping[str, Path], images: Path, size: tuple[int, int], longest: int
 ) -> tuple[list[str], tuple[int, int]]:
-    """Write photographs for COLMAP, at most `longest` pixels wide and high, into the folder `images`.
-
-    Returns the files' names, in the order of `photographs`, and their width and height [pixels]. The files have no EXIF
-    orientation, because COLMAP would turn them by it.
-    """
+    """Write photographs for COLMAP, at most `longest` pixels wide and high, into the folder `images`. Returns the
+    files' names, in the order of `photographs`, and their width and height [pixels]. The files have no EXIF
+    orientation, because COLMAP would turn them by it."""
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
     images.mkdir(exist_ok=True)
@@ -229,11 +227,9 @@ def image_pairs(count: int) -> IntArray:
 def _find_and_match(
     folder: Path, names: list[str], params: str, settings: CaptureSettings, say: Callable[[str], None]
 ) -> None:
-    """Find features in the reduced photographs, match them, and write both to the database in `folder`.
-
-    Results of an interrupted run in the database are kept. `names` are the reduced photographs' files in the order in
-    which they were taken. `params` are the lens's parameters at that size, as COLMAP writes them; empty: guessed.
-    """
+    """Find features in the reduced photographs, match them, and write both to the database in `folder`. Results of an
+    interrupted run in the database are kept. `names` are the reduced photographs' files in the order in which they were
+    taken. `params` are the lens's parameters at that size, as COLMAP writes them; empty: guessed."""
     import pycolmap
 
     database, images = folder / _DATABASE, folder / _IMAGES

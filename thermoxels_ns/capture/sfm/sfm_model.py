@@ -82,10 +82,8 @@ class SparseDepth:
 
 
 def _plane(offset: FloatArray, inverse: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return inverse depths (n,) at offset 0 of n planes, each fitted to k points, and the points' scatter (n,).
-
-    The points have an `offset` (n, k, 2) in the image at depth 1, an `inverse` depth (n, k) and a `weight` (n, k).
-    """
+    """Return inverse depths (n,) at offset 0 of n planes, each fitted to k points, and the points' scatter (n,). The
+    points have an `offset` (n, k, 2) in the image at depth 1, an `inverse` depth (n, k) and a `weight` (n, k)."""
     reach = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-12
     weight = weight / (1.0 + np.sum((offset / reach) ** 2, axis=2))
     total = weight.sum(axis=1)
