@@ -174,7 +174,7 @@ class ThermalDataParser(DataParser):
         )
 
     def pixels_averaged(self, lenses: Sequence[Camera]) -> int:
-        """Return k, so that the training photographs fit into `photographs_gb` if k x k pixels are averaged to one.
+        """Return the least k for which photographs averaged over k x k pixels fit into the option `photographs_gb`.
 
         `lenses` are the photographs' cameras. With the option `downscale_factor`, k is 1. Above 1, k is printed.
         """

@@ -166,7 +166,8 @@ def draw_generator(*key: int) -> torch.Generator:
 
 
 def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> Int[Tensor, " usable"] | None:
-    """Return the indices of the usable pixels; None if all (or a mask None) are. Raises `SceneError` if none is."""
+    """Return the indices of the usable pixels; None if all are usable or the mask is None. Raises `SceneError` if none
+    is usable; `name` and `remedy` are for its message."""
     if usable is None or bool(usable.all()):
         return None
     numbers = usable.nonzero()[:, 0]

@@ -38,7 +38,7 @@ class _Resolution(ctypes.Structure):
 
 
 class _Parameters(ctypes.Structure):
-    """Measurement parameters of `libdirp`, with spare room for fields that newer libraries add."""
+    """Measurement parameters of `libdirp`. Newer libraries also write the air temperature, and have spare room."""
 
     _fields_ = [
         ("distance_m", ctypes.c_float),

@@ -293,7 +293,7 @@ def box_between(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:
 
 
 def box_beside(axis: int, across: tuple[float, float], along: tuple[float, float], height: tuple[float, float]) -> Box:
-    """Return a box that spans `across` (ends in any order) on `axis` (0: x, 1: y), `along` on y or x, `height` in z."""
+    """Return a box: `across` (ends in any order) on `axis` (0: x, 1: y), `along` on the other one, `height` in z."""
     through = (min(across), max(across))
     (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
     return (x0, y0, height[0]), (x1, y1, height[1])
@@ -326,7 +326,7 @@ def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[
 
 
 def _merged_blocks(mask: BoolArray) -> Iterator[tuple[int, int, int, int]]:
-    """Yield u0, u1, v0, v1 of disjoint blocks [u0, u1) x [v0, v1) that together cover the True entries of `mask`."""
+    """Yield u0, u1, v0, v1 of disjoint blocks [u0, u1) x [v0, v1) that cover `mask`. They grow along v, then u."""
     left = mask.copy()
     for u0, v0 in np.argwhere(mask):
         if not left[u0, v0]:
