@@ -341,7 +341,7 @@ class _Work:
         off_by = conditions.camera.repeatability.off_by
 
         def drawn(draws: Draws, flow_w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Return flow, area, U-value of p patches and their sum, (p + 1, k) each; adds own errors to `flow_w`."""
+            """Return flow, area, U-value of p patches and of all together, (p + 1, k), with each patch's errors."""
             off_k = np.stack([draws.local(off_by, n) for n in range(count)])
             size = np.stack([1.0 + one * draws.geometry(n) for n, one in enumerate(wider.tolist())])
             flow_w, area = members @ ((flow_w + slope_w_k * off_k) * size), members @ (area_m2[:, None] * size)

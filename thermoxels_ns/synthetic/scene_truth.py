@@ -70,7 +70,7 @@ def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> t
 
 @dataclass(frozen=True)
 class CameraWalk:
-    """Cameras on a straight line. The camera at a share of it looks at the point at that share of a second line."""
+    """Cameras on a straight line; each looks at the point at the same share of the length of a second line."""
 
     ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
     aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]

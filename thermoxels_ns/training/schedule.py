@@ -50,7 +50,7 @@ class Schedule:
 def schedule_for(resolution: int, steps: int, voxel_pixels: float = 0.0) -> Schedule:
     """Return the schedule of a training of `steps` steps that ends with `resolution` voxels along the longest side.
 
-    `voxel_pixels` is the width of the last voxels, [pixels], by which a scene adapts the resolutions; 0: it does not.
+    If `voxel_pixels` is above 0, a scene later adapts the resolutions to last voxels about that wide, [pixels].
     Raises `ThermoxelsError` if `resolution` is below 1 or `steps` below 10.
 
     >>> schedule_for(128, 1000).refine_at

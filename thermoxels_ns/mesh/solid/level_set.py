@@ -106,7 +106,7 @@ def _beside(cells: BoolArray, axis: int) -> npt.NDArray[np.uint8]:
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
     """Return the smoothed `level`, shifted so that the solid volume around each voxel is about that of `sharp`.
 
-    Smoothing alone leaves a third of a bar one voxel thick. For each voxel near the surface, the solid share is found
+    Smoothing alone shrinks a one-voxel bar to a third. For each voxel near the surface, the solid share is found
     from the trilinear level, and the wanted share from the sign changes of the sharp level along the axes. The
     difference of the shares is averaged with weights 1 4 6 4 1 along each axis. This average divided by the area of the
     surface around the voxel is the distance by which the surface should move. Averages below `UNNOTICED` times the
