@@ -3,12 +3,10 @@
 import itertools
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 from torch.nn.functional import normalize
 
 from tests.reference.two_renderers import (
@@ -25,7 +23,7 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused
 from thermoxels_ns.render.fused import render as fused_render
-from thermoxels_ns.render.kernels import AHEAD, prefetch
+from thermoxels_ns.render.kernels import AHEAD
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import sample_rays
 
@@ -257,14 +255,3 @@ def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch)
         assert fused._room[len(grid.density)] > room
         assert all(torch.equal(found.gradients[name], value) for name, value in expected.gradients.items())
         assert all(torch.equal(found.values[name], value) for name, value in expected.values.items())
-
-
-def test_hint_is_compiled_in():
-    """A hint that does nothing at all would pass every other test."""
-
-    @njit
-    def hint(values, row):
-        prefetch(values, row, 1)
-
-    hint(np.zeros((4, 2), np.float32), 10**6)  # reads nothing
-    assert "call void @llvm.prefetch" in "".join(hint.inspect_llvm().values())

@@ -7,35 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 
 from thermoxels_ns.core.kernel_cache import kernel
-
-
-def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
-    """Return signature and code generator, for numba, of `prefetch`: load ``array[row, column]`` into the cache. For a
-    1-D array, ``array[row]`` is loaded. No result depends on the call, and an index out of range does no harm."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array_type = signature.args[0]
-        made = context.make_array(array_type)(context, builder, arguments[0])
-        index = [
-            context.cast(builder, value, kind, types.intp)
-            for value, kind in zip(arguments[1:], signature.args[1:], strict=True)
-        ][: array_type.ndim]
-        place = cgutils.get_item_pointer(context, builder, array_type, made, index, wraparound=False, boundscheck=False)
-        address, number = builder.bitcast(place, cgutils.voidptr_t), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [address.type, number, number, number])
-        hint = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
-        builder.call(hint, [address, number(0), number(3), number(1)])  # to be read; for all caches; data
-        return context.get_dummy_value()
-
-    return types.void(array, row, column), generate
-
-
-prefetch: Any = intrinsic(_prefetch)  # called as prefetch(array, row, column)
 
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
@@ -45,8 +18,6 @@ BLOCK = 8  # Voxels along the side of a block of `KeptVoxels`
 OPAQUE = 100.0  # Largest optical depth of a step; light behind such a step is 0
 EXP_LIMIT = 15.0  # Raw density above which the activation `exp` stays constant
 AHEAD = 8  # Samples of a ray that `march_rays` finds and reads before it weighs them
-NEAR, FAR = 8, 24
-"""While `shade` reads a sample, it prefetches corner values NEAR samples ahead, and row numbers FAR samples ahead."""
 RELU, SOFTPLUS, EXP = 0, 1, 2
 DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
 """Bits of `SampleGradients.uses`: the parameters for which a sample has a gradient."""
@@ -249,14 +220,6 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
 
 
 @kernel
-def prefetch_corners(values: Floats, rows: Ints, number: int):
-    """Load the first channel of `values` at the corners of voxel `number` into the cache; see `prefetch_colours`."""
-    for corner in range(4):
-        row = np.int64(rows[number, corner])
-        prefetch(values, row, 0)
-
-
-@kernel
 def place_of(records: Records, n: int):
     """Return the place of the sample of record `n` in its voxel: x, y and z, each from 0 to 1."""
     return float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
@@ -312,15 +275,12 @@ def march_rays(
                 i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, path, volume)
                 if i < 0:
                     break
-                prefetch(volume.voxel_rows, number, 0)
                 at = n + found
                 records.number[at], records.step[at] = number, i
                 records.fraction[at, 0], records.fraction[at, 1], records.fraction[at, 2] = fx, fy, fz
                 distance[found], length_of[found] = t, delta
                 found += 1
                 i += 1
-            for k in range(found):
-                prefetch_corners(volume.density, volume.voxel_rows, records.number[n + k])
             for k in range(found):
                 number, (fx, fy, fz) = records.number[n + k], place_of(records, n + k)
                 raw[k] = gather_one(volume.density, volume.voxel_rows, number, fx, fy, fz, 0)
@@ -355,21 +315,6 @@ def march_rays(
 
 
 @kernel
-def prefetch_colours(values: Floats, rows: Ints, number: int):
-    """Load the colours `values` at the corners of voxel `number` into the cache; `rows` is `Volume.voxel_rows`."""
-    channels = values.shape[1]
-    if channels == 3:
-        prefetch_corners(values, rows, number)
-        return
-    for corner in range(4):
-        row = np.int64(rows[number, corner])
-        prefetch(values, row, 0)
-        prefetch(values, row, 16)
-        prefetch(values, row + 1, 0)
-        prefetch(values, row + 1, channels - 1)
-
-
-@kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
     """Write colour and temperature of rays `first` to before `last` to `sums` (paper, eq. 1 and 2).
 
@@ -382,7 +327,6 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
     coefficients = np.empty(channels, volume.sh.dtype)
     thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
     basis, thermal_basis = np.empty(9), np.empty(9)
-    end = records.offset[last - 1] + records.used[last - 1]
     for r in range(first, last):
         wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
         if wants_rgb:
@@ -392,14 +336,6 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
         red, green, blue, thermal = 0.0, 0.0, 0.0, 0.0
         wanted = records.used[r] if wants_rgb or wants_thermal else 0
         for n in range(records.offset[r], records.offset[r] + wanted):
-            if n + FAR < end:
-                prefetch(volume.voxel_rows, records.number[n + FAR], 0)
-            if n + NEAR < end and records.weight[n + NEAR] > settings.smallest_weight:
-                # The sample ahead may belong to the next ray, which mostly wants what this ray wants.
-                if wants_rgb:
-                    prefetch_colours(volume.sh, volume.voxel_rows, records.number[n + NEAR])
-                if wants_thermal:
-                    prefetch_corners(volume.temperature, volume.voxel_rows, records.number[n + NEAR])
             if not records.weight[n] > settings.smallest_weight:  # as recorded: the backward pass compares this too
                 continue
             number, (fx, fy, fz), weight = records.number[n], place_of(records, n), float(records.weight[n])

@@ -26,13 +26,10 @@ from thermoxels_ns.render.kernels import (
     Volume,
     basis_of,
     chord,
-    prefetch,
 )
 
 _FLAT_EXP = math.exp(EXP_LIMIT) * (1.0 - 1e-6)
 """Density from which the activation `exp` is constant, times 1 - 1e-6: densities are rounded to single precision."""
-NEAR, FAR = 8, 16
-"""Sums are prefetched NEAR samples ahead, the places of sums FAR samples ahead, and records 2 FAR samples ahead."""
 
 
 class RayGradients(NamedTuple):
@@ -243,26 +240,6 @@ def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradie
 
 
 @kernel
-def prefetch_sample(samples: SampleGradients, n: int):
-    """Load the gradients and the place of sample `n` into the cache."""
-    prefetch(samples.number, n, 0)
-    prefetch(samples.fraction, n, 0)
-    prefetch(samples.raw_density, n, 0)
-    prefetch(samples.temperature, n, 0)
-    prefetch(samples.logits, n, 0)
-
-
-@kernel
-def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
-    """Load the gradient sums at the corners of voxel `number` into the cache; useless for rows of other threads."""
-    for corner in range(4):
-        row = voxel_rows[number, corner]
-        prefetch(rows.density, rows.place[row, 0], 0)
-        prefetch(rows.sh, rows.place[row, 1], 0)
-        prefetch(rows.temperature, rows.place[row, 2], 0)
-
-
-@kernel
 def corner_shares(samples: SampleGradients, n: int, shares: Floats):
     """Write the trilinear weights of the corners at sample `n`, in order of `CORNER_OFFSETS`, to `shares` (8,)."""
     one = shares.dtype.type(1.0)
@@ -296,15 +273,6 @@ def add_samples(
     begin, end = first_voxel(volume.voxel_rows, 3, first_row - 1), first_voxel(volume.voxel_rows, 0, last_row)
     stop = order.group[_groups_before(end, order)]
     for at in range(order.group[begin >> order.shift], stop):
-        if at + 2 * FAR < stop:
-            prefetch_sample(samples, order.record[at + 2 * FAR])
-        if at + FAR < stop:
-            number = samples.number[order.record[at + FAR]]
-            for corner in range(4):
-                prefetch(rows.place, volume.voxel_rows[number, corner], 0)
-        if at + NEAR < stop:
-            number = samples.number[order.record[at + NEAR]]
-            prefetch_sums(rows, volume.voxel_rows, number)
         n, r = order.record[at], order.ray[at]
         number, bits = samples.number[n], samples.uses[n]
         if volume.voxel_rows[number, 3] + 1 < first_row or volume.voxel_rows[number, 0] >= last_row:
