@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 from threadpoolctl import threadpool_limits
 
 from tests.support.looking_cameras import looking_at
@@ -244,11 +245,7 @@ def trained(cells: np.ndarray) -> GridSnapshot:
     """A field as training leaves one: opaque voxels, temperature 20 to 21, some corners unseen, cameras around."""
     cells = np.asarray(cells, dtype=bool)
     lattice = Lattice((-1.0, -1.0, -1.0), 2.0 / max(cells.shape), tuple(n + 1 for n in cells.shape))  # type: ignore[arg-type]
-    solid = np.pad(cells, 1)
-    touched = np.zeros(lattice.shape, dtype=bool)
-    nx, ny, nz = lattice.shape
-    for dx, dy, dz in np.ndindex(2, 2, 2):
-        touched |= solid[dx : dx + nx, dy : dy + ny, dz : dz + nz]
+    touched = binary_dilation(np.pad(cells, (0, 1)), np.ones((2, 2, 2)), origin=-1)
     random = np.random.default_rng(0)
     weight = np.where(touched & (random.random(lattice.shape) < 0.8), 3.0, 0.1).astype(np.float32)
     weight[tuple(np.argwhere(touched)[:1].T)] = 3.0
@@ -293,6 +290,7 @@ HARD: dict[str, Callable[[], np.ndarray]] = {
     "checkerboard": lambda: np.indices((7, 6, 8)).sum(axis=0) % 2 == 0,
     "noise": lambda: np.random.default_rng(3).random((9, 10, 8)) < 0.4,
     "full": lambda: np.ones((6, 5, 7), dtype=bool),
+    "hollow": lambda: boxes((3, 3, 3)) & ~boxes((4, 4, 4), size=1),
     "a lattice of one voxel": lambda: np.ones((1, 1, 1), dtype=bool),
 }
 
@@ -318,8 +316,12 @@ def test_hard_bodies_become_sound_meshes(name: str, mode) -> None:
     assert_sound(built, mode)
     assert np.array_equal(built.solid.cells, cells) or built.unobserved_parts > 0
     if mode == "voxel":
-        voxel_m = 2.0 * 2.0 / max(cells.shape)
-        assert check_mesh(built.mesh).volume_m3 == pytest.approx(built.solid.cells.sum() * voxel_m**3)
+        voxel_m, quality, mesh = 2.0 * 2.0 / max(cells.shape), check_mesh(built.mesh), built.mesh
+        count, faces = built.solid.cells.sum(), exposed_faces(built.solid.cells)
+        assert signed_volumes(mesh.points_m, mesh.tets) == pytest.approx(np.full(6 * count, voxel_m**3 / 6), rel=1e-14)
+        assert quality.volume_m3 == pytest.approx(count * voxel_m**3, rel=1e-14)
+        assert len(mesh.facets) == 2 * faces and quality.area_m2 == pytest.approx(faces * voxel_m**2, rel=1e-14)
+        assert quality.dihedral_range_deg == pytest.approx((45.0, 90.0))
 
 
 def test_a_small_body_in_256_cubed_voxels() -> None:
@@ -334,36 +336,6 @@ def exposed_faces(cells: np.ndarray) -> int:
     """Number of voxel faces between solid and empty."""
     padded = np.pad(cells, 1)
     return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
-
-
-def voxels(*others: tuple[int, int, int]) -> np.ndarray:
-    """The middle one of 3 x 3 x 3 voxels, and others."""
-    cells = np.zeros((3, 3, 3), dtype=bool)
-    cells[tuple(zip((1, 1, 1), *others))] = True
-    return cells
-
-
-PATTERNS = {
-    "single": voxels(),
-    "sharing a face": voxels((1, 2, 1)),
-    "sharing an edge": voxels((2, 2, 1)),
-    "sharing a corner": voxels((2, 2, 2)),
-    "checkerboard": np.indices((4, 3, 5)).sum(axis=0) % 2 == 0,
-    "full": np.ones((3, 3, 3), dtype=bool),
-    "hollow": ~voxels(),
-}
-
-
-@pytest.mark.parametrize("name", PATTERNS)
-def test_volume_area_and_validity(mesh_of_cells, name):
-    cells = PATTERNS[name]
-    mesh = mesh_of_cells(cells, voxel_size=0.5)
-    quality = check_mesh(mesh)
-    assert signed_volumes(mesh.points_m, mesh.tets) == pytest.approx(np.full(6 * cells.sum(), 0.5**3 / 6), rel=1e-14)
-    assert quality.volume_m3 == pytest.approx(cells.sum() * 0.5**3, rel=1e-14)
-    assert len(mesh.facets) == 2 * exposed_faces(cells)
-    assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.5**2, rel=1e-14)
-    assert quality.dihedral_range_deg == pytest.approx((45.0, 90.0))
 
 
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):

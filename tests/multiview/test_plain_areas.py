@@ -8,11 +8,19 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop, upwards
 from thermoxels_ns.multiview.differences import without_gains
 from thermoxels_ns.multiview.evidence import PhotographEvidence
-from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.photographs import Photographs, gathered
 from thermoxels_ns.multiview.stereo import Depths, feature_rays_to_depths
 
 WIDTH, HEIGHT, FOCAL = 60, 48, 50.0
 SKY, WALL, GROUND, DARK = (0.55, 0.57, 0.6), (0.9, 0.88, 0.85), (0.3, 0.35, 0.2), (0.1, 0.1, 0.15)
+
+
+LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""The axes of a level camera, x right, y down, z forward, in a world with z up."""
+
+
+def turned_by(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
 
 
 def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns=(0,) * 6) -> tuple[Photographs, np.ndarray]:
@@ -28,30 +36,17 @@ def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns=(0,) * 6) -> tuple[Photo
     is_sky = np.ones((HEIGHT, WIDTH), dtype=bool)
     is_sky[12:14, 13:47] = is_sky[14:36, 15:45] = is_sky[36:] = False
     noise = np.random.default_rng(0).normal(0.0, 0.004, (6, HEIGHT, WIDTH, 3))
-    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x right, y down, z forward; z up in world
-    matrices, sizes, pictures, warmths, skies = [], [], [], [], []
+    pinholes, centres, skies = [], [], []
     for number in range(6):
-        bearing = 0.1 * number
-        turn = np.array([[np.cos(bearing), np.sin(bearing), 0], [-np.sin(bearing), np.cos(bearing), 0], [0, 0, 1.0]])
         quarter = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns[number])
         shown = np.rot90(picture + noise[number], turns[number])
         middle = np.array([[FOCAL, 0, shown.shape[1] / 2], [0, FOCAL, shown.shape[0] / 2], [0, 0, 1]])
-        centre = np.array([0.2 * number, -3.0, 1.0])
-        rotation = quarter @ level @ turn
-        matrices.append(middle @ np.column_stack((rotation, -rotation @ centre)))
-        pictures.append(shown.reshape(-1, 3))
-        sizes.append(shown.shape[1::-1])
-        warmths.append(np.rot90(warm, turns[number]).ravel())
+        centres.append(np.array([0.2 * number, -3.0, 1.0]))
+        rotation = quarter @ LEVEL @ turned_by(0.1 * number)
+        matrix = middle @ np.column_stack((rotation, -rotation @ centres[-1]))
+        pinholes.append((shown.astype(np.float32), np.rot90(warm, turns[number]), matrix))
         skies.append(np.rot90(is_sky, turns[number]).ravel())
-    seen = Photographs(
-        np.stack(matrices),
-        np.array([[0.2 * number, -3.0, 1.0] for number in range(6)]),
-        np.array(sizes),
-        np.arange(6) * WIDTH * HEIGHT,
-        np.concatenate(pictures).astype(np.float32),
-        np.concatenate(warmths).astype(np.float32),
-    )
-    return seen, np.concatenate(skies)
+    return gathered(pinholes, centres), np.concatenate(skies)
 
 
 def first_of(seen: Photographs, count: int) -> Photographs:
@@ -106,35 +101,24 @@ def room() -> tuple[Photographs, np.ndarray, np.ndarray]:
 
     The room is 6 x 6 m wide and 3 m high. Walls and ceiling are plain and have temperatures of 0.5 and 0.6.
     """
-    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     middle = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(HEIGHT * WIDTH))) @ np.linalg.inv(middle).T @ level
-    matrices, centres, depth = [], [], []
-    for bearing in 0.25 * np.pi * np.arange(8):
-        turn = np.array([[np.cos(bearing), np.sin(bearing), 0], [-np.sin(bearing), np.cos(bearing), 0], [0, 0, 1.0]])
+    along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(HEIGHT * WIDTH))) @ np.linalg.inv(middle).T @ LEVEL
+    draw, pinholes, centres, depths = np.random.default_rng(0), [], [], []
+    for turn in map(turned_by, 0.25 * np.pi * np.arange(8)):
         centre = -1.5 * turn[1] + (0.0, 0.0, 1.6)  # stands back from the wall that it looks at
         with np.errstate(divide="ignore"):
             far = np.where(along @ turn > 0, np.array([3.0, 3.0, 3.0]) - centre, np.array([-3.0, -3.0, 0.0]) - centre)
             reach = far / (along @ turn)
-        depth.append(
-            np.where(reach.argmin(1) == 2, np.where((along @ turn)[:, 2] > 0, np.nan, reach[:, 2]), reach.min(1))
-        )
-        matrices.append(middle @ np.column_stack((level @ turn, -level @ turn @ centre)))
+        ceiling = (reach.argmin(1) == 2) & ((along @ turn)[:, 2] > 0)
+        colours = np.where(ceiling[:, None], SKY, WALL) + draw.normal(0.0, 0.004, (len(along), 3))
+        picture = colours.reshape(HEIGHT, WIDTH, 3).astype(np.float32)
+        matrix = middle @ np.column_stack((LEVEL @ turn, -LEVEL @ turn @ centre))
+        pinholes.append((picture, np.where(ceiling, 0.6, 0.5).astype(np.float32), matrix))
         centres.append(centre)
-    depths = np.concatenate(depth).astype(np.float32)
-    is_ceiling = np.isnan(depths)
-    count = len(depths)
-    colours = np.where(is_ceiling[:, None], SKY, WALL) + np.random.default_rng(0).normal(0.0, 0.004, (count, 3))
-    seen = Photographs(
-        np.stack(matrices),
-        np.stack(centres),
-        np.array([[WIDTH, HEIGHT]] * 8),
-        np.arange(8) * WIDTH * HEIGHT,
-        colours.astype(np.float32),
-        np.where(is_ceiling, 0.6, 0.5).astype(np.float32),
-    )
-    return seen, depths, is_ceiling
+        depths.append(np.where(ceiling, np.nan, reach.min(1)))
+    depth = np.concatenate(depths).astype(np.float32)
+    return gathered(pinholes, centres), depth, np.isnan(depth)
 
 
 def test_a_plain_ceiling_is_no_sky_unless_it_is_colder_than_all_around():

@@ -11,7 +11,7 @@ from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.solid.free_space import FacetViews, facet_views
 from thermoxels_ns.mesh.tetrahedra import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
-from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.photographs import Photographs, gathered
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.multiview.votes import FEWEST_POINTS, air_voxels, hardly_shown, supporting_photographs, votes
 from thermoxels_ns.synthetic.scene_truth import look_at
@@ -157,7 +157,7 @@ def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 def drawn_photographs() -> Photographs:
     views = looking_at((0.0, 0.0, 0.4), EYES, focal=225.0, size=WIDTH)
     matrices, centres = views.matrices(), views.camera_to_world[:, :, 3]
-    rng, pictures = np.random.default_rng(0), []
+    rng, pinholes, unknown = np.random.default_rng(0), [], np.full((WIDTH, WIDTH), np.nan, np.float32)
     side = np.arange(WIDTH) + 0.5
     pixels = np.stack([*np.meshgrid(side, side), np.ones((WIDTH, WIDTH))], -1).reshape(-1, 3)
     for matrix, centre in zip(matrices, centres):
@@ -166,10 +166,9 @@ def drawn_photographs() -> Photographs:
         picture = np.tile(SKY, (len(rays), 1))
         met = np.isfinite(distance)
         picture[met] = colours(centre + distance[met, None] * rays[met], normal[met])
-        pictures.append(picture + rng.normal(0.0, 0.006, picture.shape))
-    firsts = np.arange(len(EYES)) * WIDTH * WIDTH
-    shown = np.concatenate(pictures).astype(np.float32)
-    return Photographs(matrices, centres, views.size, firsts, shown, np.full(len(shown), np.nan, np.float32))
+        shown = (picture + rng.normal(0.0, 0.006, picture.shape)).astype(np.float32)
+        pinholes.append((shown.reshape(WIDTH, WIDTH, 3), unknown, matrix))
+    return gathered(pinholes, centres)
 
 
 @cache

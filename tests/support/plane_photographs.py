@@ -1,7 +1,7 @@
 import numpy as np
 
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.photographs import Photographs, gathered
 
 LATTICE = Lattice((-0.5, -0.5, -0.5), 1.0 / 16, (17, 17, 17))
 PLANE = -0.125
@@ -22,17 +22,11 @@ def photographs(eyes=EYES, gains: np.ndarray | None = None, size: int = SIZE, sc
     turned = np.diag([1.0, -1.0, -1.0])  # x right, y down, z forward of a camera that looks along -z
     intrinsics = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
     column, row = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
-    matrices, pictures = [], []
+    pinholes = []
     for number, eye in enumerate(np.asarray(eyes, dtype=float)):
         height = eye[2] - PLANE
         picture = texture(scale * (eye[0] + column * height), scale * (eye[1] - row * height))
-        pictures.append(picture * (1.0 if gains is None else gains[number]))
-        matrices.append(intrinsics @ np.column_stack((turned, -turned @ eye)))
-    return Photographs(
-        np.stack(matrices),
-        np.asarray(eyes, dtype=float),
-        np.full((len(eyes), 2), size),
-        np.arange(len(eyes)) * size * size,
-        np.concatenate(pictures).reshape(-1, 3).astype(np.float32),
-        np.full(len(eyes) * size * size, np.nan, np.float32),
-    )
+        shown = (picture * (1.0 if gains is None else gains[number])).astype(np.float32)
+        matrix = intrinsics @ np.column_stack((turned, -turned @ eye))
+        pinholes.append((shown, np.full((size, size), np.nan, np.float32), matrix))
+    return gathered(pinholes, eyes)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.multiview.photographs import Photographs, gathered
+from thermoxels_ns.multiview.photographs import gathered
 from thermoxels_ns.training.plain_areas import ALIKE, PlainAreas, bend_loss
 
 WIDTH, HEIGHT, FOCAL = 40, 30, 30.0
@@ -10,18 +10,15 @@ INTRINSICS = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 
 CPU = torch.device("cpu")
 
 
-def photographs(picture: np.ndarray, centre=(0.0, 0.0, -2.0)) -> Photographs:
-    """One photograph that looks along z, x to the right and y down."""
-    matrix = INTRINSICS @ np.column_stack((np.eye(3), -np.array(centre)))
-    return gathered([(picture.astype(np.float32), np.full(picture.shape[:2], np.nan, np.float32), matrix)], [centre])
-
-
 def areas_of(picture: np.ndarray, known=(), backdrop=()) -> PlainAreas:
+    """Those of one photograph from (0, 0, -2) along z, x to the right and y down."""
+    matrix = INTRINSICS @ np.column_stack((np.eye(3), (0.0, 0.0, 2.0)))
+    pinhole = picture.astype(np.float32), np.full(picture.shape[:2], np.nan, np.float32), matrix
     marks = np.zeros((2, HEIGHT, WIDTH), bool)
     for mark, places in zip(marks, (known, backdrop)):
         for rows, columns in places:
             mark[rows, columns] = True
-    return PlainAreas(photographs(picture), marks[0].ravel(), marks[1].ravel())
+    return PlainAreas(gathered([pinhole], [(0.0, 0.0, -2.0)]), marks[0].ravel(), marks[1].ravel())
 
 
 def pixels_of(areas: PlainAreas, count: int = 400) -> np.ndarray:
