@@ -229,18 +229,12 @@ def half_in_kelvin(scene) -> None:
         np.save(scene.path / "thermal" / f"{name}.npy", np.eye(18, 24) + 20.0 + 273.15 * (number >= 5))
 
 
-def in_fahrenheit(scene) -> None:
-    all_in(".npy", np.full((18, 24), 84.0) + 0.1 * np.eye(18, 24))(scene)
-    write_bounds(15.0, 25.0)(scene)
-
-
 def test_kelvins_that_are_meant_and_a_sky_far_below_the_bounds_are_read(scene_folder):
     scene = scene_folder()
     half_in_kelvin(scene)
     scene.rewrite()
     assert parse(scene.path, thermal_bounds=(10.0, 300.0)).metadata["temperature_range"].max_c == 300.0
-    all_in(".npy", np.eye(18, 24) - 80.0)(scene)
-    write_bounds(10.0, 30.0)(scene)
+    with_bounds(10.0, 30.0, np.eye(18, 24) - 80.0)(scene)
     scene.rewrite()
     assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
 
@@ -317,9 +311,8 @@ def parallel(scene) -> None:
         ]
 
 
-def in_degrees_with_bounds_in_kelvins(scene) -> None:
-    all_in(".npy", np.eye(18, 24) + 20.0)(scene)
-    write_bounds(283.0, 303.0)(scene)
+def with_bounds(low: float, high: float, values: np.ndarray):
+    return lambda scene: (all_in(".npy", values)(scene), write_bounds(low, high)(scene))
 
 
 def mask_all_but_one(scene) -> None:
@@ -367,8 +360,12 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (give_twice, r"frame_train_000\.png more than once"),
         (turn_photograph, "frame 3.*EXIF orientation 6"),
         (half_in_kelvin, r"most of the other files, got 293\.15 C"),
-        (in_fahrenheit, r"near 15 to 25 C, .* got 84\.00 C in the middle.*correct the bounds"),
-        (in_degrees_with_bounds_in_kelvins, r"20\.00 C in the middle"),
+        # In Fahrenheit, and with bounds in kelvins.
+        (
+            with_bounds(15.0, 25.0, 84.0 + 0.1 * np.eye(18, 24)),
+            r"near 15 to 25 C, .* got 84\.00 C in the middle.*correct the bounds",
+        ),
+        (with_bounds(283.0, 303.0, 20.0 + np.eye(18, 24)), r"20\.00 C in the middle"),
         (content_of("images/frame_train_001.png", b"no picture"), "frame_train_001"),
         (content_of("thermal/frame_eval_002.png", b""), "frame_eval_002"),
         (lambda scene: (scene.path / "thermal" / "frame_train_003.png").unlink(), "frame_train_003.*--missing-thermal"),

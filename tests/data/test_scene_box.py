@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.looking_cameras import looking_at
 from tests.support.scene_folders import look_at_origin
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import box_of_points, find_scene_box
 from thermoxels_ns.data.scene_file import Frame, read_scene_file
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
 BLOCK = np.array([0.5, 0.35, 0.25])
@@ -142,21 +142,11 @@ def test_a_plain_wall_without_points_is_held_too(tmp_path):
     assert 1.4 < box[1, 0] < 2.2 and -2.0 < box[0, 0] < -1.5, box
 
 
-def seen_by(of: Frame, lens: Camera, eye: tuple[float, ...], target: tuple[float, ...]) -> Frame:
-    (view,) = looking_at(target, eye).camera_to_world
-    return replace(of, pose=np.concatenate((view, [[0.0, 0.0, 0.0, 1.0]])), intrinsics=lens)
-
-
 def test_points_near_the_edges_of_photographs_alone_and_a_blind_camera_give_a_box(tmp_path):
     of, lens = frames_of(tmp_path, [around(0)])[0], Camera(200, 150, 200.0, 200.0, 100.0, 75.0)
-    at = (-3.0, 0.0, 0.0), (-3.0, 0.2, 0.0), (-3.0, 0.0, 0.0)
-    frames = [seen_by(of, lens, eye, (x, eye[1], 0.0)) for eye, x in zip(at, (0.0, 0.0, -6.0))]
+    looks = (((-3.0, 0.0, 0.0), 0.0), ((-3.0, 0.2, 0.0), 0.0), ((-3.0, 0.0, 0.0), -6.0))
+    frames = [replace(of, pose=look_at(eye, (x, eye[1], 0.0)), intrinsics=lens) for eye, x in looks]
     draw = np.random.default_rng(1)
-    rim = np.column_stack(
-        (
-            draw.uniform(-0.3, 0.0, 120),
-            draw.choice([-1.0, 1.0], 120) * draw.uniform(1.15, 1.3, 120),
-            draw.uniform(-0.9, 0.9, 120),
-        )
-    )
+    rim = draw.uniform((-0.3, 1.15, -0.9), (0.0, 1.3, 0.9), (120, 3))
+    rim[:, 1] *= draw.choice([-1.0, 1.0], 120)
     assert np.isfinite(box_of_points(rim, frames)).all()

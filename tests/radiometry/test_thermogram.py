@@ -179,8 +179,10 @@ HARD: dict[str, tuple[bytes, str, str]] = {
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_files_that_are_no_thermal_images_are_refused_by_name(tmp_path, name):
+def test_files_that_are_no_thermal_images_are_refused_by_name(tmp_path, name, monkeypatch):
     content, said, remedy = HARD[name]
+    if name.startswith(("wide", "huge")):  # a header alone allocates nothing
+        monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("pixels were decoded"))
     (tmp_path / name).write_bytes(content)
     options = RadiometryOptions(camera="workswell") if name.endswith(("tiff", "png")) else None
     with warnings.catch_warnings(), pytest.raises(ThermalFileError, match=said) as caught:
@@ -193,17 +195,6 @@ def test_files_that_are_no_thermal_images_are_refused_by_name(tmp_path, name):
         with warnings.catch_warnings(), pytest.raises(ThermalFileError, match=name):
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             read_thermal_file(tmp_path / name, ThermalUnit.bounds(-10.0, 40.0))
-
-
-def test_a_header_alone_allocates_nothing(tmp_path, monkeypatch):
-    def refuse(self: Image.Image) -> None:
-        raise AssertionError("pixels were decoded")
-
-    for name, content in (("a.png", bad_png(30000, 2000)), ("a.tiff", bad_tiff(30000, 2000))):
-        (tmp_path / name).write_bytes(content)
-        monkeypatch.setattr(Image.Image, "load", refuse)
-        with pytest.raises(ThermalFileError, match="30000 x 2000"):
-            read_thermogram(tmp_path / name, RadiometryOptions(camera="workswell"))
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path):

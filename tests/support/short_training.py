@@ -5,12 +5,14 @@ The optimisers, their schedules and the callbacks are those of the default metho
 
 import io
 import json
+from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 
@@ -125,3 +127,10 @@ def train(
     data = {"data": scene, "train_num_rays_per_batch": rays, "thermal_num_rays_per_batch": rays}
     overrides = {"cpu_threads": 1, "datamanager": data, "model": plain | (model or {})}
     return Training(overrides, steps, rate=rate).advance(steps).pipeline.eval()
+
+
+def rays_along_minus_x(places: torch.Tensor | None = None) -> Iterator[RayBundle]:
+    """Parallel rays from x = 3 at all pairs of places across, of which there are 40 from -0.97 to 0.97 unless told."""
+    y, z = torch.meshgrid(*[torch.linspace(-0.97, 0.97, 40) if places is None else places] * 2, indexing="ij")
+    for part in torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3).split(300):
+        yield RayBundle(part, torch.tensor([-1.0, 0.0, 0.0]).expand_as(part), torch.ones(len(part), 1))

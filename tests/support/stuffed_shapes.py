@@ -68,6 +68,10 @@ def centres(*shape: int) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
+SHIFT = np.array([0.0137, -0.0071, 0.0043])
+"""Where the middle of a shape is, so that there is no symmetry between it and the lattice."""
+
+
 @dataclass(frozen=True)
 class Shape:
     """A body in a box of side 2 with its exact measures."""
@@ -82,8 +86,7 @@ class Shape:
     def level(self, cells: int, voxels_to_one: float = 1.5) -> np.ndarray:
         """Levels on `cells`^3 voxels that reach 1 so many voxels from the surface."""
         size = 2.0 / cells
-        # No symmetry between the body and the lattice.
-        points = centres(cells, cells, cells) * size - [0.0137, -0.0071, 0.0043]
+        points = centres(cells, cells, cells) * size - SHIFT
         return np.clip(-self.distance(points) / (voxels_to_one * size), -1.0, 1.0)
 
 
@@ -95,20 +98,17 @@ def _cylinder(p: np.ndarray) -> np.ndarray:
     return box_distance(np.stack([np.hypot(p[..., 0], p[..., 1]), p[..., 2]], axis=-1), np.array([0.5, 0.7]))
 
 
-def _slab(degrees: float) -> Shape:
-    a, b, c = half = np.array([0.7, 0.25, 0.5])
-    return Shape(
-        lambda p: box_distance(p @ turn(degrees), half), 8 * a * b * c, 8 * (a * b + b * c + a * c), 8 * (a + b + c)
-    )
+def turned_box(half: tuple[float, float, float], rotation: np.ndarray) -> Shape:
+    a, b, c = half
+    area, edges = 8 * (a * b + b * c + a * c), 8 * (a + b + c)
+    return Shape(lambda p: box_distance(p @ rotation, np.array(half)), 8 * a * b * c, area, edges)
 
 
 SHAPES: dict[str, Shape] = {
     "sphere": Shape(lambda p: np.linalg.norm(p, axis=-1) - 0.8, 4 / 3 * np.pi * 0.8**3, 4 * np.pi * 0.8**2),
     "torus": Shape(_torus, 2 * np.pi**2 * 0.6 * 0.25**2, 4 * np.pi**2 * 0.6 * 0.25),
     "cylinder": Shape(_cylinder, np.pi * 0.25 * 1.4, 2 * np.pi * 0.5 * (1.4 + 0.5), 4 * np.pi * 0.5),
-    "slab at 0 degrees": _slab(0.0),
-    "slab at 30 degrees": _slab(30.0),
-    "slab at 45 degrees": _slab(45.0),
+    **{f"slab at {degrees} degrees": turned_box((0.7, 0.25, 0.5), turn(degrees)) for degrees in (0, 30, 45)},
 }
 
 

@@ -10,6 +10,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
+from tests.support.short_training import rays_along_minus_x
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.snapshot import Views
@@ -45,15 +46,8 @@ class Rays:
         self.views = Views(poses, np.full((2, 2), 50.0), np.full((2, 2), 50.0), np.full((2, 2), 100.0))
         self.train_dataset = SimpleNamespace(views=lambda: self.views)
 
-    def look_closer(self, camera: int) -> None:
-        """Let a camera see 14 degrees around the x axis alone."""
-        self.views.focal[camera] = 200.0
-
     def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
-        y, z = torch.meshgrid(*[self.places] * 2, indexing="ij")
-        origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
-        for part in origins.split(400):
-            yield RayBundle(part, torch.tensor([-1.0, 0.0, 0.0]).expand_as(part), torch.ones(len(part), 1))
+        yield from rays_along_minus_x(self.places)
 
 
 @pytest.mark.parametrize("dilation, layers", [(0, [1, 2]), (1, [1, 2, 3]), (2, [0, 1, 2, 3, 4])])
@@ -187,8 +181,7 @@ def test_voxels_that_fewer_than_two_photographs_show_go(narrow):
     points = np.array([[9.0, 9.0, 9.0]])
     model.feature_rays = FeatureRays(np.array([[8.0, 9.0, 9.0]]), np.arange(1), points, np.ones(1))
     given: Any = attributes(model, 10)
-    for camera in range(narrow):
-        given.pipeline.datamanager.look_closer(camera)
+    given.pipeline.datamanager.views.focal[:narrow] = 200.0  # these see 14 degrees around the x axis alone
     next(steps_of(model, given, 1))
     centres = model.grid.lattice.cell_centres()
     beside = np.abs(centres[..., 1:]).max(axis=-1) > 0.25 * (3.0 - centres[..., 0])

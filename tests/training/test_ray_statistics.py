@@ -4,8 +4,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.rays import RayBundle
 
+from tests.support.short_training import rays_along_minus_x
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune
@@ -38,15 +38,6 @@ def slab(backend: Backend = "fused") -> Scene:
     grid.density.data = torch.where(corners[:, :1] < 0.01, 500.0, 0.0)
     grid.temperature.data = 0.5 + 0.25 * corners[:, 1:2]
     return sampled(grid, backend)
-
-
-def rays_along_minus_x(n: int = 40, chunk: int = 300):
-    y, z = torch.meshgrid(*[torch.linspace(-0.97, 0.97, n)] * 2, indexing="ij")
-    origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
-    directions = torch.tensor([-1.0, 0.0, 0.0]).expand_as(origins)
-    for start in range(0, len(origins), chunk):
-        part = slice(start, start + chunk)
-        yield RayBundle(origins[part], directions[part], torch.ones(len(origins[part]), 1))
 
 
 def total_weight(scene) -> torch.Tensor:

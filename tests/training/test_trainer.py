@@ -33,7 +33,9 @@ def one_writer_at_a_time(monkeypatch) -> None:
 
 
 def trainer(scene: Path, folder: Path, *options: str) -> ThermoxelsTrainer:
-    return configured(scene, folder, *options).setup(local_rank=0, world_size=1)
+    made = configured(scene, folder, *options).setup(local_rank=0, world_size=1)
+    made.setup()
+    return made
 
 
 def configured(scene: Path, folder: Path, *options: str) -> Any:
@@ -52,7 +54,6 @@ def checkpoints(scene, tmp_path_factory) -> Path:
     """Checkpoints on the first lattice of a draft, of 32 voxels, as if from different steps."""
     folder = tmp_path_factory.mktemp("checkpoints")
     made = trainer(scene, folder, *DRAFT, "--save-only-latest-checkpoint", "False")
-    made.setup()
     for step in (99, 499, 799):
         made.save_checkpoint(step)
     return made.checkpoint_dir
@@ -82,7 +83,6 @@ FIRST_LATTICE = ("--pipeline.model.resolutions", "32", "--pipeline.model.refine-
 def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, capsys, options, resumed, steps, said):
     file = ("--load-checkpoint", str(checkpoints / "step-000000099.ckpt")) if resumed else ()
     made = trainer(scene, tmp_path, *options, *file)
-    made.setup()
     assert (made._start_step, made.config.max_num_iterations) == steps
     assert said in words(capsys)
 
@@ -98,7 +98,7 @@ def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, 
 )
 def test_checkpoints_that_a_training_cannot_go_on_from(scene, checkpoints, tmp_path, options, message):
     with pytest.raises(CheckpointError, match=message):
-        trainer(scene, tmp_path, *options, "--load-dir", str(checkpoints)).setup()
+        trainer(scene, tmp_path, *options, "--load-dir", str(checkpoints))
 
 
 @pytest.mark.parametrize("steps", [10, 33, 400, 20_000])
@@ -226,23 +226,20 @@ def test_two_trainings_into_one_folder_are_refused(scene, tmp_path):
 
 def test_a_finished_training_goes_on_as_it_was_without_its_options(scene, tmp_path, monkeypatch):
     """The remedy of a finished quality: leave it out and pass a number of steps."""
-    options = ["--pipeline.model.resolutions", "32", "--pipeline.model.refine-at", "--max-num-iterations", "800"]
-    made = trainer(scene, tmp_path, *options, "--optimizers.sh.scheduler.max-steps", "800")
+    options = ("--max-num-iterations", "800", "--optimizers.sh.scheduler.max-steps", "800")
+    made = trainer(scene, tmp_path, *FIRST_LATTICE, *options)
     made.config.save_config()
-    made.setup()
     made.save_checkpoint(799)
     again = trainer(scene, tmp_path / "again", "--load-dir", str(made.checkpoint_dir), "--max-num-iterations", "400")
-    again.setup()
     assert again.config.pipeline.model.resolutions == (32,) and again._start_step == 800
     assert again.config.optimizers["sh"]["scheduler"].max_steps == 800
     monkeypatch.setattr("sys.argv", ["ns-train", "--pipeline.model.resolutions", "32", "64", "128"])
     with pytest.raises(CheckpointError, match="expected at least 128 voxels at step 800"):
-        trainer(scene, tmp_path / "other", "--load-dir", str(made.checkpoint_dir)).setup()
+        trainer(scene, tmp_path / "other", "--load-dir", str(made.checkpoint_dir))
 
 
 def test_a_full_disk_is_one_line_and_loses_no_checkpoint(scene, tmp_path):
     made = trainer(scene, tmp_path)
-    made.setup()
     made.save_checkpoint(10)
     said = r"step-000000020.ckpt: expected room for it, got .*MB of free space. Free space, then .*--load-dir"
     with files_end_after(10_000), pytest.raises(OutputError, match=said):
@@ -253,7 +250,6 @@ def test_a_full_disk_is_one_line_and_loses_no_checkpoint(scene, tmp_path):
 
 def test_a_disk_that_fills_up_while_training_is_one_line(scene, tmp_path):
     made = trainer(scene, tmp_path, "--steps-per-save", "1", "--max-num-iterations", "3")
-    made.setup()
     said = r"checkpoint .*: expected room for it, got .* Free space, then train again"
     with files_end_after(200_000), pytest.raises(OutputError, match=said):
         made.train()

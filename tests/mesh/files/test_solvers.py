@@ -120,7 +120,7 @@ def read_grids(path) -> dict[str, pv.UnstructuredGrid]:
     return {name: blocks[name] for name in blocks.keys()}  # noqa: SIM118
 
 
-def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
+def test_vtk_reads_body_and_boundary_and_tags_come_first_with_their_names(tmp_path, tagged_mesh):
     write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
     grids = read_grids(tmp_path / "house.xdmf")
     assert set(grids) == {BODY_GRID, FACET_GRID}
@@ -134,11 +134,7 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
         assert np.array_equal(grid.point_data["observed"], tagged_mesh.observed)
         assert grid.point_data["colour"].shape == tagged_mesh.colour.shape
-
-
-def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
-    """FEniCSx takes the first attribute of a grid for its tags."""
-    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
+    # FEniCSx takes the first attribute of a grid for its tags.
     grids = {grid.get("Name"): grid for grid in ElementTree.parse(tmp_path / "house.xdmf").iter("Grid")}
     assert grids[BODY_GRID].find("Attribute").get("Name") == "region"
     assert grids[FACET_GRID].find("Attribute").get("Name") == "patch"

@@ -6,6 +6,7 @@ from scipy.spatial import KDTree
 from tests.support.stuffed_shapes import (
     ANGLE_BOUNDS_DEG,
     SHAPES,
+    SHIFT,
     Shape,
     box_distance,
     centres,
@@ -15,6 +16,7 @@ from tests.support.stuffed_shapes import (
     random_turn,
     tet_mesh,
     turn,
+    turned_box,
 )
 from thermoxels_ns.mesh.quality.checks import MeshFigures, check_mesh, dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
@@ -219,13 +221,6 @@ def test_place_in_the_lattice_does_not_matter():
 
 CELLS = 48
 VOXEL = 2.0 / CELLS
-SHIFT = np.array([0.0137, -0.0071, 0.0043])
-"""Where the middle of `stuffed_shapes.Shape` is not."""
-
-
-def turned_box(half: tuple[float, float, float], seed: int) -> Shape:
-    rotation, (a, b, c) = random_turn(seed), half
-    return Shape(lambda p: box_distance(p @ rotation, np.array(half)), 8 * a * b * c, 8 * (a * b + b * c + a * c))
 
 
 def sharpened(level: np.ndarray) -> tuple[StuffedSolid, StuffedSolid, np.ndarray]:
@@ -265,7 +260,7 @@ def crossings(solid: StuffedSolid) -> int:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_boxes_at_any_angle(seed, noise):
-    shape = turned_box((0.7, 0.25, 0.5), seed)
+    shape = turned_box((0.7, 0.25, 0.5), random_turn(seed))
     level = shape.level(CELLS, 1.0)
     level = np.clip(level + noise * np.random.default_rng(seed).normal(size=level.shape), -1.0, 1.0)
     solid, sharp, _ = sharpened(level)
@@ -298,7 +293,7 @@ def test_concave_edges_as_well():
 
 def test_angles_move_length_and_topology_are_as_promised():
     for seed in range(3):
-        solid, sharp, nodes = sharpened(turned_box((0.5, 0.4, 0.3), seed).level(32, 1.0))
+        solid, sharp, nodes = sharpened(turned_box((0.5, 0.4, 0.3), random_turn(seed)).level(32, 1.0))
         assert len(nodes) > 100
         assert np.all(np.linalg.norm(sharp.points - solid.points, axis=1) <= 1.0)
         assert on_surface(solid)[nodes].all()
