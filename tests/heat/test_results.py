@@ -30,7 +30,7 @@ def two_walls() -> HeatProblem:
     return HeatProblem(mesh, {"brick": BRICK, "wool": WOOL}, effects=effects)
 
 
-def test_u_values_of_two_walls_side_by_side() -> None:
+def test_u_values_and_the_worst_spot_of_two_walls_side_by_side() -> None:
     """U = 1 / (1/8 + 0.2/k + 1/25): 2.21878 of brick, 0.19361 of wool; f_Rsi = 1 - U / 8 at the worse one."""
     problem = two_walls()
     wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
@@ -44,15 +44,12 @@ def test_u_values_of_two_walls_side_by_side() -> None:
     assert wall.heat_w == pytest.approx(30.0 * wall.coupling_w_k, rel=1e-12)
     assert wall.temperature_factor == pytest.approx(1.0 - u["brick"] / 8.0, rel=1e-9)
     assert wall.coldest.point_m[0] == 0.0 and wall.coldest.point_m[1] <= 1.0 and wall.coldest.patches[0] == "x0"
-
-
-def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
+    # Of a cooled room the warmest spot is the worst.
     effects = (Convection(("x0",), 8.0, 5.0), Convection(("x1",), 25.0, 35.0))
-    problem = dataclasses.replace(two_walls(), effects=effects)
+    problem = dataclasses.replace(problem, effects=effects)
     wall = wall_result(problem, solve_steady(problem), ("x0",), 5.0, 35.0)
-    u = 1.0 / (1 / 8 + 0.2 / 0.7 + 1 / 25)
-    assert wall.temperature_factor == pytest.approx(1.0 - u / 8.0, rel=1e-9)
-    assert wall.coldest.temperature_c == pytest.approx(5.0 + 30.0 * u / 8.0, rel=1e-9)
+    assert wall.temperature_factor == pytest.approx(1.0 - u["brick"] / 8.0, rel=1e-9)
+    assert wall.coldest.temperature_c == pytest.approx(5.0 + 30.0 * u["brick"] / 8.0, rel=1e-9)
     assert wall.coldest.point_m[1] <= 1.0 and wall.heat_w < 0.0
 
 

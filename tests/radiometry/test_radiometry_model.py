@@ -25,14 +25,12 @@ TEMPERATURES_C = np.array([-30.0, -5.0, 0.0, 19.5, 20.0, 36.6, 120.0, 400.0])
 
 emissivities = st.floats(0.3, 1.0)
 celsius = st.floats(-20.0, 80.0)
-distances = st.floats(0.0, 100.0)
-humidities = st.floats(0.0, 1.0)
 conditions = st.builds(
     Conditions,
     emissivity=emissivities,
     reflected_c=celsius,
-    distance_m=distances,
-    relative_humidity=humidities,
+    distance_m=st.floats(0.0, 100.0),
+    relative_humidity=st.floats(0.0, 1.0),
     air_c=celsius,
     window_transmission=st.floats(0.5, 1.0),
     window_c=celsius,

@@ -35,10 +35,11 @@ def plain_areas() -> PlainAreas:
 LINES = FeatureRays(np.array([[0.0, 0.0, 3.0]]), np.array([0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.01]))
 
 
-def make(feature_rays: FeatureRays | None = None, **options) -> ThermoxelsModel:
+def make(feature_rays: FeatureRays | None = None, size: float = 1.0, seen=(), **options) -> ThermoxelsModel:
+    """A model of the box, so many times as large, with what else is known of the photographs."""
     config = ThermoxelsModelConfig(**{"resolutions": (8,), "refine_at": (), "prune_at": (), **options})
-    metadata = {"temperature_range": TemperatureRange(10.0, 30.0), "feature_rays": feature_rays}
-    return config.setup(scene_box=BOX, num_train_data=4, metadata=metadata)
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0), "feature_rays": feature_rays, **dict(seen)}
+    return config.setup(scene_box=SceneBox(aabb=BOX.aabb * size), num_train_data=4, metadata=metadata)
 
 
 def rays(n: int = 60, stream: int | None = RGB_STREAM | THERMAL_STREAM) -> RayBundle:
@@ -266,11 +267,9 @@ def test_depth_of_a_miss_does_not_depend_on_its_neighbours():
 
 def test_other_sizes_of_the_world_are_converted():
     """The same scene ten times larger starts equally transparent and costs the same distortion."""
-    config = ThermoxelsModelConfig(resolutions=(8,), refine_at=(), prune_at=(), distortion_ramp=(0, 1), near_plane=0.5)
-    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
     results = []
     for size in (1.0, 10.0):
-        model = config.setup(scene_box=SceneBox(aabb=BOX.aabb * size), num_train_data=4, metadata=metadata).train()
+        model = make(size=size, distortion_ramp=(0, 1), near_plane=0.5).train()
         model.update_to_step(5)
         bundle = rays()
         bundle.origins = bundle.origins * size
@@ -355,12 +354,9 @@ def test_resolutions_follow_the_photographs_up_to_a_limit(voxels, expected):
     ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (96, 192, 384)), (None, (32, 64, 128))]
 )
 def test_a_model_has_the_voxels_that_its_photographs_ask_for(pixel_size, expected):
-    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
-    if pixel_size is not None:
-        metadata["pixel_size"] = pixel_size
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
-    config = ThermoxelsModelConfig(voxel_pixels=1.6)
-    model = config.setup(scene_box=box, num_train_data=4, metadata=metadata)
+    default = {name: getattr(ThermoxelsModelConfig(), name) for name in ("resolutions", "refine_at", "prune_at")}
+    seen = {} if pixel_size is None else {"pixel_size": pixel_size}
+    model = make(seen=seen, **default, voxel_pixels=1.6)
     assert isinstance(model, ThermoxelsModel) and model.config.resolutions == expected
     assert max(model.grid.lattice.cell_shape) == expected[0]
 
