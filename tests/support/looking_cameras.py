@@ -7,10 +7,10 @@ from thermoxels_ns.core.snapshot import Views
 
 
 def looking_at(target: npt.ArrayLike, eyes: npt.ArrayLike, focal: float = 100.0, size: int = 200) -> Views:
-    """Square pinhole cameras at the given places, all turned to one point; 90 degrees wide unless told."""
-    poses = []
-    for eye in np.atleast_2d(np.asarray(eyes, dtype=np.float64)):
-        back = eye - np.asarray(target, dtype=np.float64)
+    """Square pinhole cameras at given places, turned to one point or each to its own; 90 degrees wide unless told."""
+    eyes, poses = np.atleast_2d(np.asarray(eyes, dtype=np.float64)), []
+    for eye, at in zip(eyes, np.broadcast_to(target, eyes.shape)):
+        back = eye - at
         back /= np.linalg.norm(back)
         up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
         right = np.cross(up, back)

@@ -12,8 +12,6 @@ from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_
 from thermoxels_ns.mesh.temperature import tet_conductances
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
-CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
-
 
 def crossed_diagonals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two voxels side by side, and the same with the second mirrored: diagonals on the face that they share cross."""
@@ -30,7 +28,7 @@ def _turned_over(mesh):
 
 
 def _three_owners(mesh):
-    points = np.vstack([CORNER_TET, [[0.0, 0.0, 5.0], [0.0, 0.0, -1.0]]])
+    points = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [0, 0, 5], [0, 0, -1]])
     return mesh_from(points, np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]]))
 
 
