@@ -45,8 +45,7 @@ def _trainer(
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         pipeline=ThermoxelsPipelineConfig(
-            datamanager=ThermalDataManagerConfig(),
-            model=ThermoxelsModelConfig(voxel_pixels=VOXEL_PIXELS),
+            datamanager=ThermalDataManagerConfig(), model=ThermoxelsModelConfig(voxel_pixels=VOXEL_PIXELS)
         ),
         optimizers={
             "density": _group(0.3, 0.03, optimizer),

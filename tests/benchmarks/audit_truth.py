@@ -37,15 +37,7 @@ import numpy as np
 import tyro
 from measuring import append_row, print_head, print_row, read_rows, run_of, run_quietly, trained
 
-from tests.support.audited_house import (
-    CONTACT_M,
-    ELEMENTS,
-    SLAB,
-    SLAB_LENGTH_M,
-    house_mesh,
-    house_scene,
-    patches_yaml,
-)
+from tests.support.audited_house import CONTACT_M, ELEMENTS, SLAB, SLAB_LENGTH_M, house_mesh, house_scene, patches_yaml
 from tests.support.audited_wall import (
     CONDUCTIVITY,
     INSIDE,

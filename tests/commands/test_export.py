@@ -257,8 +257,7 @@ def exported(ball, tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("size_bytes", "broken"),
-    [(1000, "summary-unfinished.json"), (75_000, "mesh.vtu"), (120_000, r"mesh.*\.png")],
+    ("size_bytes", "broken"), [(1000, "summary-unfinished.json"), (75_000, "mesh.vtu"), (120_000, r"mesh.*\.png")]
 )
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(ball, exported, tmp_path, size_bytes, broken) -> None:
     shutil.copytree(exported, tmp_path, dirs_exist_ok=True)

@@ -389,12 +389,7 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (of_scene(test_filenames=["images/gone.png"]), r"test_filenames: .*gone\.png"),
         *(
             (of_scene(scene_box=box), "scene_box.*two corners")
-            for box in (
-                [[0, 0, 0], [1, 1, 0]],
-                [[1, 0, 0], [0, 1, 1]],
-                [[0, 0, 0], [1, 1, "x"]],
-                [1, 2],
-            )
+            for box in ([[0, 0, 0], [1, 1, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0], [1, 1, "x"]], [1, 2])
         ),
         *((written(text), r"transforms\.json") for text in ("{", "[]", '{"frames": []}', '{"w": 3}', "[" * 200_000)),
         (lambda scene: shutil.rmtree(scene.path), "no such folder"),
@@ -420,12 +415,7 @@ def test_what_has_no_partner_is_left_out_if_one_asks_for_it(scene_folder):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"downscale_factor": 0},
-        {"photographs_gb": 0.0},
-        {"eval_mode": "interval", "eval_interval": 1},
-    ],
+    "options", [{"downscale_factor": 0}, {"photographs_gb": 0.0}, {"eval_mode": "interval", "eval_interval": 1}]
 )
 def test_options_that_cannot_be_are_refused(scene_folder, options):
     with pytest.raises(SceneError, match=list(options)[-1]):

@@ -79,11 +79,7 @@ class Parts:
     """
 
     def __init__(
-        self,
-        conditions: Conditions,
-        surface: AuditedSurface,
-        draws: Draws,
-        which: Sequence[IntArray],
+        self, conditions: Conditions, surface: AuditedSurface, draws: Draws, which: Sequence[IntArray]
     ) -> None:
         """Take the triangles of each part; the caller must leave out triangles that do not count."""
         self.conditions, (self.groups, of_triangle) = conditions, surface.alike

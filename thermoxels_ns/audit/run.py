@@ -244,10 +244,7 @@ def audit_mesh(
 
 
 def audit(
-    mesh: TetMesh,
-    conditions: Conditions,
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    least_bridge_w: float = 0.0,
+    mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0), least_bridge_w: float = 0.0
 ) -> Audit:
     """Return heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
 

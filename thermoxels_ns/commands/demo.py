@@ -121,9 +121,7 @@ def demo_commands(folder: Path) -> dict[str, list[str]]:
             *("--image-format", "png", "--colormap-options.colormap", "inferno"),
             *("--output-path", str(folder / "renders")),
         ],
-        "Export the mesh": [
-            *(*export, "--metres-per-unit", "1", "--output-dir", str(folder / "export")),
-        ],
+        "Export the mesh": [*(*export, "--metres-per-unit", "1", "--output-dir", str(folder / "export"))],
         "Audit the house": [
             *("thermoxels", "audit", str(folder / "export" / "mesh.vtu")),
             *("--conditions", str(survey / "conditions.yaml"), "--scene", scene),

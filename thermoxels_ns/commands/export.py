@@ -23,12 +23,7 @@ from thermoxels_ns.core.json_values import plain_values, write_json
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.layouts import scene_json
-from thermoxels_ns.data.scene_scale import (
-    SceneScale,
-    choose_scale,
-    scale_from_known_distance,
-    up_from_scene_file,
-)
+from thermoxels_ns.data.scene_scale import SceneScale, choose_scale, scale_from_known_distance, up_from_scene_file
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, facet_normals, support_of_facets
 

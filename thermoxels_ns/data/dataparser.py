@@ -293,10 +293,7 @@ def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, flo
 
 
 def survey_thermal_files(
-    paths: Sequence[Path],
-    unit: ThermalUnit,
-    bounds_c: tuple[float, float] | None,
-    training: Collection[Path],
+    paths: Sequence[Path], unit: ThermalUnit, bounds_c: tuple[float, float] | None, training: Collection[Path]
 ) -> tuple[dict[Path, tuple[int, int]], TemperatureRange]:
     """Read all thermal files; return the shape (h, w) of each by its path, and the temperature range of the scene.
 

@@ -18,12 +18,7 @@ Vector = FloatArray
 OVERSHOOT_K = 0.01  # A temperature outside its range is reported if it is farther outside than this, [K]
 
 
-def solve_steady(
-    problem: HeatProblem,
-    *,
-    order: int = 1,
-    relative_tolerance: float = 1e-12,
-) -> SteadySolution:
+def solve_steady(problem: HeatProblem, *, order: int = 1, relative_tolerance: float = 1e-12) -> SteadySolution:
     """Return the steady state of a problem: div(k grad T) + s = 0 with the source s, and the effects on the boundary.
 
     With linear tetrahedra without obtuse angles, only a flux or source can drive a temperature out of the range of the

@@ -11,12 +11,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection, matching_names
-from thermoxels_ns.fem.solution import (
-    Solution,
-    SolutionNodes,
-    SteadySolution,
-    solution_nodes,
-)
+from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.heat.effects import Convection, InternalHeat
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.mesh.quality.checks import facet_owners

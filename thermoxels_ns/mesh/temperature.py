@@ -54,10 +54,7 @@ def interpolate_corners(
 
 
 def extend_harmonically(
-    edges: IntArray,
-    temperature_c: npt.NDArray[np.floating],
-    observed: BoolArray,
-    edge_weights: npt.NDArray,
+    edges: IntArray, temperature_c: npt.NDArray[np.floating], observed: BoolArray, edge_weights: npt.NDArray
 ) -> FloatArray:
     """Return the temperatures of all nodes, shape (n,), [degrees Celsius], by harmonic extension to unobserved nodes.
 

@@ -147,10 +147,7 @@ def even_pixels(picture: Float32Array) -> BoolArray:
 
 
 def _alike(
-    values: Float32Array,
-    directions: FloatArray,
-    chosen: BoolArray,
-    measured: Float32Array | None = None,
+    values: Float32Array, directions: FloatArray, chosen: BoolArray, measured: Float32Array | None = None
 ) -> BoolArray:
     """Return which pixels look like most of the `chosen` ones, by colour and, if known, temperature, (pixels,).
 

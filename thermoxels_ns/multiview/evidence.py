@@ -14,12 +14,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
-from thermoxels_ns.multiview.stereo import (
-    depths_before_backdrop,
-    depths_of,
-    feature_rays_to_depths,
-    rays_through,
-)
+from thermoxels_ns.multiview.stereo import depths_before_backdrop, depths_of, feature_rays_to_depths, rays_through
 
 LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure depth; fewer may be chance
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box

@@ -13,12 +13,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo_kernels import (
-    add_differences,
-    aggregate,
-    correlate,
-    weigh_patches,
-)
+from thermoxels_ns.multiview.stereo_kernels import add_differences, aggregate, correlate, weigh_patches
 
 NEIGHBOURS = 4
 """Most photographs that each photograph is compared with, its neighbours. At each pixel only the better half of them

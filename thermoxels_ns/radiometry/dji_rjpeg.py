@@ -13,11 +13,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.decoders import (
-    app_segments,
-    check_thermal_size,
-    errors_name,
-)
+from thermoxels_ns.radiometry.decoders import app_segments, check_thermal_size, errors_name
 from thermoxels_ns.radiometry.measurement_model import Conditions, RadiometryOptions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"

@@ -16,13 +16,7 @@ from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.radiometry.decoders import (
-    JPEG_START,
-    PNG_START,
-    check_not_empty,
-    check_thermal_size,
-    errors_name,
-)
+from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, check_not_empty, check_thermal_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 

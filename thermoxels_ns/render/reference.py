@@ -170,9 +170,7 @@ def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Gri
 
 
 def total_variation(
-    rows: Float[Tensor, "rows c"],
-    corners: Int64[Tensor, "voxels 8"],
-    channels: int | None = None,
+    rows: Float[Tensor, "rows c"], corners: Int64[Tensor, "voxels 8"], channels: int | None = None
 ) -> Float[Tensor, ""]:
     """Return the mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4).
 

@@ -14,15 +14,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.appearance import (
-    Paint,
-    SunLight,
-    everywhere,
-    plain,
-    room_rgb,
-    sky_rgb,
-    sky_temperature_c,
-)
+from thermoxels_ns.synthetic.appearance import Paint, SunLight, everywhere, plain, room_rgb, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
 from thermoxels_ns.synthetic.random_scene import (
     painted_scene,
@@ -309,10 +301,7 @@ def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float =
 
 def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
     """Return a scene of a plan. By default, its background is a room at the lower of its `temperature_bounds_c`."""
-    room = {
-        "background_rgb": room_rgb,
-        "background_temperature_c": everywhere(fields["temperature_bounds_c"][0]),
-    }
+    room = {"background_rgb": room_rgb, "background_temperature_c": everywhere(fields["temperature_bounds_c"][0])}
     return painted_scene(plan, light=light, **(room | fields))
 
 

@@ -58,14 +58,7 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
     # The published training configuration of the original code, TV and beta as there. Its sparsity of density is left
     # out: with a weight of 1e-11 the term is 5e-11 beside 2 of all others.
     "paper": LossWeights(
-        tv_density=5e-3,
-        tv_sh=5e-2,
-        tv_temperature=1e-6,
-        beta=1e-5,
-        distortion=0.0,
-        tracks=0.0,
-        backdrop=0.0,
-        bend=0.0,
+        tv_density=5e-3, tv_sh=5e-2, tv_temperature=1e-6, beta=1e-5, distortion=0.0, tracks=0.0, backdrop=0.0, bend=0.0
     ),
 }
 

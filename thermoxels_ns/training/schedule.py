@@ -10,11 +10,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 COARSEST = 32  # Least first resolution, [voxels along the longest side], of a training that refines
 # The shares of the run below were set by hand while the losses were tuned; only all of them together were measured.
-_REFINE: Mapping[int, tuple[float, ...]] = {
-    0: (),
-    1: (0.25,),
-    2: (0.2, 0.5),
-}
+_REFINE: Mapping[int, tuple[float, ...]] = {0: (), 1: (0.25,), 2: (0.2, 0.5)}
 """By number of refinements, the share of the run at which each happens. With three refinements 320 voxels begin as 40,
 too few for a body that fills a third of the box: of what cameras see of wild-14, F is 0.82, and 0.86 with two."""
 _PRUNE_AFTER = 0.13  # Share of the run between a refinement and the pruning that drops what it left empty

@@ -36,10 +36,7 @@ _CHANCE_DRAWS = 3
 
 
 def estimate_rig(
-    frames: Sequence[RigFrame],
-    visible: Camera,
-    start: RigEstimate,
-    say: Callable[[str], None] = lambda _: None,
+    frames: Sequence[RigFrame], visible: Camera, start: RigEstimate, say: Callable[[str], None] = lambda _: None
 ) -> RigEstimate:
     """Return the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 

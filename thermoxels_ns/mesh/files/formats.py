@@ -120,11 +120,7 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     far = np.abs(points).max() > _FAR_SIZES * (upper - lower).max()
     origin = np.round(0.5 * (lower + upper)) if far else np.zeros(3)
     shown = trimesh.Trimesh(
-        points - origin,
-        triangles,
-        process=False,
-        metadata=meaning,
-        vertex_attributes={"_COLOR_0": light, **attributes},
+        points - origin, triangles, process=False, metadata=meaning, vertex_attributes={"_COLOR_0": light, **attributes}
     )
     place = turn @ trimesh.transformations.translation_matrix(origin)
     scene = trimesh.Scene()
