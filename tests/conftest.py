@@ -1,5 +1,4 @@
 import os
-from collections import Counter
 from pathlib import Path
 
 # Before torch is loaded: its threads gain nothing on small tests and wait for each other on a busy machine.
@@ -43,16 +42,3 @@ def pytest_xdist_make_scheduler(config, log):
         return None
     config.option.loadscopereorder = False
     return ByTraining(config, log)
-
-
-def pytest_terminal_summary(terminalreporter) -> None:
-    """Say how long each folder of tests took, added up over all processes."""
-    seconds: Counter[str] = Counter()
-    for reports in terminalreporter.stats.values():
-        for report in reports:
-            if isinstance(report, pytest.TestReport):
-                seconds["/".join(report.nodeid.split("::")[0].split("/")[:2])] += report.duration
-    if sum(seconds.values()) >= 60.0:
-        terminalreporter.section("seconds by folder")
-        for folder, took in seconds.most_common():
-            terminalreporter.line(f"{took:8.1f} s  {folder}")

@@ -66,25 +66,25 @@ NEVER = {
 MOST_LINES = {
     "audit": 3345,
     "capture": 3080,
-    "commands": 2450,
+    "commands": 2440,
     "core": 1860,
-    "data": 2385,
+    "data": 2375,
     "evaluation": 385,
     "fem": 2635,
     "field": 880,
-    "heat": 2255,
+    "heat": 2250,
     "mesh": 4605,
-    "multiview": 1740,
-    "radiometry": 1235,
-    "render": 1650,
-    "reports": 1190,
+    "multiview": 1735,
+    "radiometry": 1215,
+    "render": 1565,
+    "reports": 1180,
     "synthetic": 2750,
-    "training": 2665,
-    "root": 645,
+    "training": 2585,
+    "root": 635,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 27570
+MOST_TEST_LINES = 27300
 
 
 def room_of(module: str) -> str:

@@ -181,8 +181,8 @@ def test_stages_are_handed_to_a_cluster(tmp_path, commands):
     path, out = listed(tmp_path, hungry="train=3", wrong="train=2"), tmp_path / "out"
     said, _ = (run := started(commands, path, "--output-dir", out, "--executor", "slurm")).communicate(timeout=400)
     assert run.returncode == 2 and "1 finished, 1 not" in (out / "index.html").read_text(), said
-    asked = (folder / "jobs.log").read_text()
-    for attempt in (1, 2):  # what ran out of memory asks for twice as much
+    asked = (folder / "jobs.log").read_text()  # what ran out of memory asks for twice as much
+    for attempt in (1, 2):
         asks = f"-t {attempt * STAGES['model'].minutes} --mem {attempt * STAGES['model'].memory_mb} "
         assert re.search(f"rule_model_wildcards_hungry .*{asks}.*--cpus-per-task={STAGES['model'].threads} ", asked), (
             asked

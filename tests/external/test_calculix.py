@@ -28,7 +28,7 @@ def capacities(problem: HeatProblem) -> dict[str, HeatMatrices]:
     point, the centre, all shape functions are 1 / 4: V / 16 for each pair, which is 5 / 4 consistent - 1 / 4 lumped.
     """
     lumped, consistent = (assemble(problem.mesh, problem.material, lumped=entry) for entry in (True, False))
-    one_point = HeatMatrices(lumped.stiffness_w_k, 1.25 * consistent.mass_j_k - 0.25 * lumped.mass_j_k)
+    one_point = lumped[0], 1.25 * consistent[1] - 0.25 * lumped[1]
     return {"lumped": lumped, "consistent": consistent, "one point": one_point}
 
 
@@ -63,7 +63,7 @@ def test_surfaces_and_sets_are_the_patches(tmp_path, heat_problem, program, run_
     surfaces = re.findall(r"\*SURFACE, NAME=([^,]+),", plain)
     used = np.unique(mesh.boundary.patch)
     assert len(surfaces) == len(used) > 1
-    nodal_mass = assemble(mesh, CONCRETE).nodal_mass_j_k
+    nodal_mass = assemble(mesh, CONCRETE)[1].diagonal()
     areas = facet_areas(mesh.points_m, mesh.facets)
     for name, patch in zip(surfaces, used):
         facets = mesh.boundary.patch == patch

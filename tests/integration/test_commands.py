@@ -81,34 +81,25 @@ def test_stock_exports_still_work(trained: Trained, tmp_path):
     assert (tmp_path / "point_cloud.ply").stat().st_size > 300
 
 
-def test_mesh_export(trained: Trained, tmp_path):
-    result = run(
-        *("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
-        *("--density-percentile", "90", "--metres-per-unit", "1"),
-    )
-    assert result.returncode == 0, result.stdout
-    mesh = pyvista.read(tmp_path / "mesh.vtu")
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert mesh.n_cells == summary["mesh"]["tets"] > 0
-    low, high = np.array(json.loads((trained.scene / "transforms.json").read_text())["scene_box"])
-    slack = 0.06 * (high - low).max()  # the lattice covers the box with whole voxels
-    assert (mesh.points.min(0) > low - slack).all() and (mesh.points.max(0) < high + slack).all()
-    assert 0 <= summary["truth"]["fscore"] <= 1
-    assert sum(summary["mesh"]["share_of_area_by_support"].values()) == pytest.approx(1.0)  # photographs were asked
-    assert (tmp_path / "mesh.png").stat().st_size > 5000
-
-
-def test_mesh_takes_the_scale_of_the_scene_and_heat_refuses_it_without_one(trained: Trained, tmp_path):
+def test_a_mesh_takes_the_scale_of_the_scene_and_heat_refuses_it_without_one(trained: Trained, tmp_path):
     command = ("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
-    command += ("--density-percentile", "90", "--pictures", "False")
+    command += ("--density-percentile", "90")
     heat = ("thermoxels", "heat", str(tmp_path / "mesh.vtu"), "--scene", "concrete", "--pictures", "False")
     heat += ("--output-dir", str(tmp_path / "heat"))
     scene = trained.scene / "transforms.json"
     known = scene.read_text()
     succeed(*command)
+    mesh = pyvista.read(tmp_path / "mesh.vtu")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert mesh.n_cells == summary["mesh"]["tets"] > 0
+    low, high = np.array(json.loads(known)["scene_box"])
+    slack = 0.06 * (high - low).max()  # the lattice covers the box with whole voxels
+    assert (mesh.points.min(0) > low - slack).all() and (mesh.points.max(0) < high + slack).all()
+    assert 0 <= summary["truth"]["fscore"] <= 1 and summary["scale"]["metres_per_unit"] == 1.0
+    assert sum(summary["mesh"]["share_of_area_by_support"].values()) == pytest.approx(1.0)  # photographs were asked
+    assert (tmp_path / "mesh.png").stat().st_size > 5000
     succeed(*heat)
     assert abs(json.loads((tmp_path / "heat" / "answers.json").read_text())["balance"]["relative_residual"]) < 1e-9
-    assert json.loads((tmp_path / "summary.json").read_text())["scale"]["metres_per_unit"] == 1.0
     try:
         scene.write_text(json.dumps({key: value for key, value in json.loads(known).items() if "metres" not in key}))
         said = succeed(*command)

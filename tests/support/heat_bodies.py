@@ -1,7 +1,7 @@
 """Meshes and bodies for problems of heat flow: tetrahedra, voxels, boxes, shells, rooms and walls; their matrices."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -163,21 +163,12 @@ def nafems_t3(parts: int = 10) -> HeatProblem:
     return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
 
 
-@dataclass(frozen=True)
-class HeatMatrices:
-    """The two matrices of M dT/dt + K T = 0."""
-
-    stiffness_w_k: sparse.csr_matrix
-    mass_j_k: sparse.csr_matrix
-
-    @property
-    def nodal_mass_j_k(self) -> np.ndarray:
-        return self.mass_j_k @ np.ones(self.mass_j_k.shape[0])
-
-
 @BilinearForm
 def storage(u, v, w):
     return w.heat_capacity * u * v
+
+
+HeatMatrices = tuple[sparse.csr_matrix, sparse.csr_matrix]  # K [W / K] and M [J / K] of M dT/dt + K T = 0
 
 
 def assemble(mesh: TetMesh, material: Material, *, lumped: bool = True) -> HeatMatrices:
@@ -185,17 +176,16 @@ def assemble(mesh: TetMesh, material: Material, *, lumped: bool = True) -> HeatM
     stiffness = stiffness_matrix(mesh.points_m, mesh.tets, np.full(len(mesh.tets), material.conductivity_w_mk))
     capacity = np.full(len(mesh.tets), material.heat_capacity_j_m3k)
     if lumped:
-        nodal = lumped_mass(mesh.points_m, mesh.tets, capacity)
-        return HeatMatrices(stiffness, sparse.diags(nodal, format="csr"))
-    return HeatMatrices(stiffness, Space(Selection(mesh)).assembled(storage, 2, heat_capacity=capacity))
+        return stiffness, sparse.diags(lumped_mass(mesh.points_m, mesh.tets, capacity), format="csr")
+    return stiffness, Space(Selection(mesh)).assembled(storage, 2, heat_capacity=capacity)
 
 
 def backward_euler(matrices: HeatMatrices, start_c: np.ndarray, time: TimeSteps) -> np.ndarray:
     """Steps with given matrices and our linear solver, shape (steps, n)."""
-    solver = LinearSolver((matrices.mass_j_k / time.step_seconds + matrices.stiffness_w_k).tocsr())
-    states = [start_c]
+    (stiffness, mass), states = matrices, [start_c]
+    solver = LinearSolver((mass / time.step_seconds + stiffness).tocsr())
     for _ in range(time.steps):
-        change = solver.solve(-(matrices.stiffness_w_k @ states[-1]))
+        change = solver.solve(-(stiffness @ states[-1]))
         assert change.converged
         states.append(states[-1] + change.x)
     return np.array(states[1:])

@@ -85,10 +85,8 @@ def known_capture(
     scene, draw, radial = make_scene(scene_name), np.random.default_rng(seed), (1.2, 0.5)
     plain = scene.camera(photograph_width, photograph_width * 3 // 4)
     small = scene.camera(thermal_width, thermal_width * 4 // 5)
-    focal = small.fl_x * zoom
-    cx, cy = small.cx + centre_px[0], small.cy + centre_px[1]
-    thermal = Camera(small.width, small.height, focal, focal, cx, cy)
-    visible = Camera(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
+    focal, centre = small.fl_x * zoom, np.add((small.cx, small.cy), centre_px)
+    thermal = Camera(small.width, small.height, focal, focal, *centre.tolist())
     rig = np.eye(4)
     rig[:3, :3], rig[:3, 3] = turned(*turn_deg), baseline_m
     to_visible = OPENGL_FROM_OPENCV @ np.linalg.inv(rig) @ OPENGL_FROM_OPENCV
@@ -119,7 +117,7 @@ def known_capture(
         ids = np.flatnonzero(inside & (np.abs(depths[number][row, column] - distance) < 0.01 * distance))
         seen = (points[ids] - pose[:3, 3]) @ pose[:3, :3] * (1.0, -1.0, -1.0)
         frames.append(RigFrame(photographs[number], temperatures[number], seen, ids.astype(np.int64)))
-    return KnownCapture(frames, visible, thermal, rig, offsets, radial)
+    return KnownCapture(frames, plain, thermal, rig, offsets, radial)
 
 
 def drawn_capture(
@@ -168,7 +166,7 @@ def painted_sky() -> KnownCapture:
         points = 10.0 * visible.rays(pixels)
         ids = np.arange(len(points)) + number * len(points)
         frames.append(RigFrame(photograph, temperature_c.astype(np.float32), points, ids))
-    return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
+    return KnownCapture(frames, plain, thermal, rig, np.zeros(views), (0.0, 0.0))
 
 
 def _seen(paint: npt.NDArray[np.float32], camera: Camera, turn: FloatArray, samples: int) -> npt.NDArray:

@@ -16,10 +16,5 @@ def looking_at(target: npt.ArrayLike, eyes: npt.ArrayLike, focal: float = 100.0,
         right = np.cross(up, back)
         right /= np.linalg.norm(right)
         poses.append(np.column_stack((right, np.cross(back, right), back, eye)))
-    count = len(poses)
-    return Views(
-        np.array(poses),
-        np.full((count, 2), focal),
-        np.full((count, 2), 0.5 * size),
-        np.full((count, 2), size, dtype=np.int64),
-    )
+    both = np.ones((len(poses), 2))
+    return Views(np.array(poses), focal * both, 0.5 * size * both, (size * both).astype(np.int64))

@@ -77,8 +77,8 @@ def write_card(folder: Path, count: int = 7, drift_k: float = 0.6, stray: bool =
         grey = view(VISIBLE, pose, pictures)
         save(folder / f"shot{number}-visible.jpg", grey)
         warm = 15 + view(THERMAL, pose @ to_visible, soft).astype(np.float64) / 255 * 8
-        offset = drift_k * (-1) ** number
-        counts(folder / f"shot{number}-radiometric.tiff", warm + offset + rng.normal(0, 0.05, warm.shape))
+        warm += drift_k * (-1) ** number
+        counts(folder / f"shot{number}-radiometric.tiff", warm + rng.normal(0, 0.05, warm.shape))
     if stray:
         save(folder / f"shot{count}-visible.jpg", view(VISIBLE, where[0], textures(seed=99)))
         counts(folder / f"shot{count}-radiometric.tiff", np.full((THERMAL.height, THERMAL.width), 20.0))
