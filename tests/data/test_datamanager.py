@@ -236,22 +236,18 @@ def celsius(number: int, shape: tuple[int, int]) -> np.ndarray:
     return np.random.default_rng(number).uniform(12.0, 28.0, shape).astype(np.float32)
 
 
-def broken(number: int, shape: tuple[int, int]) -> np.ndarray:
-    """Return the same with 1 % NaN, one infinite and one impossible pixel."""
-    values = celsius(number, shape)
-    values[np.random.default_rng(100 + number).random(shape) < 0.01] = np.nan
-    values[0, 0], values[0, 1] = np.inf, -300.0
-    return values
-
-
-def test_bad_pixels_are_masked_and_the_rest_is_unchanged(scene_folder, tmp_path_factory, capsys):
+def test_bad_pixels_are_masked_and_the_rest_is_unchanged(scene_folder, capsys):
+    """The same images with 1 % NaN, one infinite and one impossible pixel."""
     size = (40, 30)
     clean = manager(scene_folder(suffix=".npy", size=size, counts=celsius).path)
     clean.train_dataset.get_thermal(0)
     expected = {index: clean.train_dataset.get_thermal(index)[0] for index in range(8)}
     batch_clean = clean.next_train(7)
     for number, path in enumerate(sorted((clean.config.data / "thermal").glob("*.npy"), key=lambda p: p.stem[-3:])):
-        np.save(path, broken(number, (30, 40)))
+        values = celsius(number, (30, 40))
+        values[np.random.default_rng(100 + number).random((30, 40)) < 0.01] = np.nan
+        values[0, 0], values[0, 1] = np.inf, -300.0
+        np.save(path, values)
     served = manager(clean.config.data)
     for index in range(8):
         got, valid = served.train_dataset.get_thermal(index)

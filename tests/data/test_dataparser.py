@@ -153,9 +153,8 @@ def test_downscaled_photographs_are_block_means_with_matching_intrinsics(scene_f
     torch.testing.assert_close(outputs.cameras.cx[0], torch.tensor([0.48 * 25 / 2]))
     full = np.asarray(Image.open(outputs.image_filenames[0])).astype(float)
     got = ThermalDataset(outputs).get_data(0, "uint8")["image"].numpy()
-    np.testing.assert_allclose(
-        got, full[:, :24].reshape(9, 2, 12, 2, 3).mean(axis=(1, 3)), atol=1.01
-    )  # Pillow rounds twice
+    means = full[:, :24].reshape(9, 2, 12, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(got, means, atol=1.01)  # Pillow rounds twice
     thermal = outputs.metadata["thermal_cameras"]
     assert thermal is not None and int(thermal.width[0]) == 25
 
@@ -306,9 +305,8 @@ def content_of(name: str, content: bytes):
 def parallel(scene) -> None:
     del scene.meta["scene_box"]
     for frame in scene.meta["frames"]:
-        frame["transform_matrix"] = [
-            [*row, pose[3]] for row, pose in zip(np.eye(3).tolist(), frame["transform_matrix"])
-        ]
+        for row, axis in zip(frame["transform_matrix"], np.eye(3).tolist()):
+            row[:3] = axis
 
 
 def with_bounds(low: float, high: float, values: np.ndarray):

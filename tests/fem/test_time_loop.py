@@ -97,18 +97,14 @@ def test_newton_ends_near_a_steady_state_and_after_it() -> None:
             assert np.abs(solution.temperature_c[-1] - steady).max() < max(10.0 * away, 1e-8)
 
 
-HOUR_S = 3600.0
-TIMES_S = np.array([0.0, 100.0, 101.0, 102.0, 200.0]) * HOUR_S
-FLASH = np.array([0.0, 0.0, 500.0, 0.0, 0.0])
-
-
 def test_adaptive_steps_do_not_step_over_a_table() -> None:
     """Two hours of heat in a week: a triangle of 500 W/m2, 1800 kJ/m2 in all."""
-    mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
-    problem = HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), tabulated(TIMES_S, FLASH)),))
-    solution = solve_heat(problem, AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
-    brought_j = float(solution.heat_w[0]) * TIMES_S[-1]
-    assert brought_j == pytest.approx(500.0 * HOUR_S * 0.01, rel=0.05)
+    mesh, times_s = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1]), 3600.0 * np.array([0, 100, 101, 102, 200])
+    flash = tabulated(times_s, np.array([0.0, 0.0, 500.0, 0.0, 0.0]))
+    solution = solve_heat(
+        HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), flash),)), AdaptiveSteps(times_s[-1], 0.5, outputs=1)
+    )
+    assert float(solution.heat_w[0]) * times_s[-1] == pytest.approx(500.0 * 3600.0 * 0.01, rel=0.05)
 
 
 SCHEMES = (BACKWARD_EULER, SDIRK2)
@@ -169,8 +165,7 @@ def test_a_body_radiates_from_1000_k_to_3_k() -> None:
     """A thin plate in the dark: rho c d dT/dt = -2 sigma T^4, so T = (T0^-3 + 6 sigma t / (rho c d))^(-1/3)."""
     thickness = 1e-3
     mesh = box_mesh([0, 0.01, 0.02], [0, 0.01, 0.02], [0, thickness], temperature_c=1000.0 - 273.15)
-    steel = STEEL
-    problem = HeatProblem(mesh, steel, effects=(Radiation(("z0", "z1"), 1.0, -273.15),))
+    problem = HeatProblem(mesh, STEEL, effects=(Radiation(("z0", "z1"), 1.0, -273.15),))
     rate = 6.0 * 5.670374419e-8 / (7800.0 * 450.0 * thickness)
     for duration, tolerance in ((600.0, 0.05), (1e9, 0.01)):
         solution = solve_heat(problem, AdaptiveSteps(duration, tolerance))

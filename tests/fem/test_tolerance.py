@@ -35,10 +35,6 @@ def true_error(found: ToleratedSolution, given: HeatProblem, exact: SteadySoluti
     return difference_between(found.solution, exact, len(given.mesh.points_m))
 
 
-def silent(line: str) -> None:
-    assert line
-
-
 def shell() -> HeatProblem:
     mesh = shell_mesh(0.5, 0.6, 4, 1, eighth=True)
     effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
@@ -55,7 +51,7 @@ def iso() -> tuple[HeatProblem, SteadySolution]:
 @pytest.mark.parametrize("tolerance", [Goals(0.2), Goals(None, 0.005)])
 def test_iso_10211_case_3(iso, tolerance) -> None:
     problem, exact = iso
-    found = solve_to_tolerance(problem, tolerance, log=silent)
+    found = solve_to_tolerance(problem, tolerance)
     settings, true = found.settings, true_error(found, problem, exact)
     assert (settings.order, settings.refinements) == (2, 0), found.levels
     assert found.met and tolerance.excess(settings.error) <= 1.0
@@ -75,7 +71,7 @@ def exact_shell() -> SteadySolution:
 @pytest.mark.parametrize(("tolerance_k", "refinements"), [(0.2, 0), (0.02, 1)])
 def test_spherical_shell(exact_shell, tolerance_k, refinements) -> None:
     problem, exact = shell(), exact_shell
-    found = solve_to_tolerance(problem, Goals(tolerance_k), log=silent)
+    found = solve_to_tolerance(problem, Goals(tolerance_k))
     assert (found.settings.order, found.settings.refinements) == (2, refinements), found.levels
     true, estimate = true_error(found, problem, exact), found.settings.error
     assert true.temperature_k <= tolerance_k and found.met
@@ -91,7 +87,7 @@ def exact_t3() -> HeatSolution:
 @pytest.mark.parametrize(("tolerance_k", "refinements"), [(2.0, 0), (0.5, 1), (0.2, 2)])
 def test_nafems_t3(exact_t3, tolerance_k, refinements) -> None:
     problem, exact = nafems_t3(), exact_t3
-    found = solve_to_tolerance(problem, Goals(tolerance_k), AdaptiveSteps(32.0), log=silent)
+    found = solve_to_tolerance(problem, Goals(tolerance_k), AdaptiveSteps(32.0))
     assert found.met and found.settings.refinements == refinements and found.settings.order == 1
     assert isinstance(found.solution, HeatSolution) and found.settings.step_tolerance_k is not None
     x, fine_x = problem.mesh.points_m[:, 0], nafems_t3(160).mesh.points_m[:, 0]
@@ -181,7 +177,7 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
     axis = np.linspace(0.0, 0.1, 5)
     mesh = box_mesh(axis, axis, [0.0, 0.025], temperature_c=200.0)
     problem = HeatProblem(mesh, Material("ceramic", 2.0, 2000.0, 900.0), effects=(effect,))
-    found = solve_to_tolerance(problem, Goals(3.0), AdaptiveSteps(1800.0, outputs=4), log=silent)
+    found = solve_to_tolerance(problem, Goals(3.0), AdaptiveSteps(1800.0, outputs=4))
     exact = solve_heat(finer(problem, 2), AdaptiveSteps(1800.0, 0.1, outputs=4))
     true = true_error(found, problem, exact)
     assert found.met and found.settings.refinements < 2
@@ -195,7 +191,7 @@ def test_errors_of_steps_that_a_body_does_not_forget_are_in_the_estimate(toleran
     day_s, side = 86_400.0, np.linspace(0.0, 0.02, 2)
     sun = Varying(lambda _, time_s: max(50.0 * np.sin(2.0 * np.pi * time_s / day_s), 0.0), resolution_s=3600.0)
     problem = HeatProblem(box_mesh(side, side, side), STEEL, effects=(HeatFlux(("*",), sun),))
-    found = solve_to_tolerance(problem, Goals(tolerance_k), AdaptiveSteps(3.0 * day_s, outputs=6), log=silent)
+    found = solve_to_tolerance(problem, Goals(tolerance_k), AdaptiveSteps(3.0 * day_s, outputs=6))
     exact = solve_heat(found.problem, AdaptiveSteps(3.0 * day_s, 0.0005, outputs=6))
     true_k = float(np.abs(found.solution.temperature_c - exact.temperature_c).max())
     assert found.met and found.settings.step_tolerance_k is not None
@@ -212,18 +208,16 @@ def test_too_little_memory_is_a_status() -> None:
     problem = shell()
     room_gb = 12_000.0 * len(problem.mesh.tets) / 2**30
     with pytest.raises(HeatError, match=r"Not within 1e-05 K: P2, given mesh.*size halved 1x needs about .* MiB"):
-        solve_to_tolerance(problem, Goals(1e-5, memory_gb=room_gb), log=silent)
-    found = solve_to_tolerance(problem, Goals(1e-5, memory_gb=room_gb, allow_unmet=True), log=silent)
+        solve_to_tolerance(problem, Goals(1e-5, memory_gb=room_gb))
+    found = solve_to_tolerance(problem, Goals(1e-5, memory_gb=room_gb, allow_unmet=True))
     assert not found.met and found.settings.order == 2 and "a larger error" in found.status
     assert np.isfinite(found.solution.temperature_c).all()
     with pytest.raises(HeatError, match="memory_bytes"):
-        solve_to_tolerance(problem, Goals(1.0, memory_gb=1e-5), log=silent)
-    transient = solve_to_tolerance(
-        nafems_t3(), Goals(0.01, memory_gb=1e-3, allow_unmet=True), AdaptiveSteps(32.0), log=silent
-    )
+        solve_to_tolerance(problem, Goals(1.0, memory_gb=1e-5))
+    transient = solve_to_tolerance(nafems_t3(), Goals(0.01, memory_gb=1e-3, allow_unmet=True), AdaptiveSteps(32.0))
     assert not transient.met and "P1 on the mesh size halved" in transient.status
     # Heat flows are something to ask for instead only where they were not asked for, and without steps.
-    flows = solve_to_tolerance(problem, Goals(None, 1e-9, memory_gb=room_gb, allow_unmet=True), log=silent)
+    flows = solve_to_tolerance(problem, Goals(None, 1e-9, memory_gb=room_gb, allow_unmet=True))
     advised = ["--flow-tolerance 0.01" in each.status for each in (found, transient, flows)]
     assert advised == [True, False, False]
 
@@ -233,9 +227,7 @@ def test_heat_that_rushes_in_at_the_start_is_not_missed(outputs: int) -> None:
     """A rod whose end is suddenly held at 100 C: the mean flow through it is 2 k dT / sqrt(pi a t)."""
     mesh = box_mesh(np.linspace(0.0, 1.2, 13), [0.0, 0.2], [0.0, 0.2], temperature_c=4.0)
     problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 100.0),))
-    found = solve_to_tolerance(
-        problem, Goals(20.0, 0.3, allow_unmet=True), AdaptiveSteps(36_000.0, outputs=outputs), log=silent
-    )
+    found = solve_to_tolerance(problem, Goals(20.0, 0.3, allow_unmet=True), AdaptiveSteps(36_000.0, outputs=outputs))
     exact_w = 0.04 * 2.0 * 1.7 * 96.0 / np.sqrt(np.pi * CONCRETE.diffusivity_m2_s * 36_000.0)
     (flow_w,) = mean_flows_w(found.solution).values()
     assert found.settings.refinements >= 1
@@ -250,7 +242,7 @@ def test_where_nothing_flows_any_share_of_it_is_met() -> None:
         (FixedTemperature(("x0",), 5.0), Convection(("x1",), 8.0, 5.0)),
         (Convection(("x0",), 8.0, 5.3), Radiation(("x1",), 0.9, 5.3)),
     ):
-        found = solve_to_tolerance(HeatProblem(mesh, CONCRETE, effects=effects), Goals(None, 0.01), log=silent)
+        found = solve_to_tolerance(HeatProblem(mesh, CONCRETE, effects=effects), Goals(None, 0.01))
         assert found.met and found.settings.refinements == 0 and found.settings.error.heat_flow == 0.0
 
 
@@ -274,9 +266,9 @@ def test_an_effect_that_acts_nowhere_brings_nothing_on_a_finer_mesh() -> None:
     tags = replace(mesh.boundary, patch_names=(*mesh.boundary.patch_names, "without triangles"))
     effects = Convection(("x0",), 50.0, 0.0), Convection(("without triangles",), 20.0, 0.0)
     problem = HeatProblem(replace(mesh, boundary=tags), CONCRETE, effects=effects)
-    found = solve_to_tolerance(problem, Goals(0.1), AdaptiveSteps(3600.0), log=silent)
+    found = solve_to_tolerance(problem, Goals(0.1), AdaptiveSteps(3600.0))
     assert found.settings.refinements > 0 and not found.solution.effects[1].heat_w.any()
-    flows = solve_to_tolerance(problem, Goals(None, 0.05), AdaptiveSteps(3600.0), log=silent)
+    flows = solve_to_tolerance(problem, Goals(None, 0.05), AdaptiveSteps(3600.0))
     assert flows.met and flows.settings.error.heat_flow < 0.05
 
 

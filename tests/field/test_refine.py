@@ -16,9 +16,8 @@ from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 
 def random_grid(activation="exp", kept: float = 1.0, temperature_degree: int = 0) -> VoxelGrid:
-    return two_renderers.random_grid(
-        1, temperature_degree, activation, kept, Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5))
-    )
+    lattice = Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5))
+    return two_renderers.random_grid(1, temperature_degree, activation, kept, lattice)
 
 
 def points_inside(grid: VoxelGrid, n: int = 300) -> torch.Tensor:

@@ -35,13 +35,8 @@ def in_lattice(point: np.ndarray) -> np.ndarray:
     return np.array([face * (DEEP + 1) + (1.0 - 1.0 / q) * DEEP, *sides])
 
 
-def outside(point: np.ndarray) -> bool:
-    lo, hi = BOX.double().numpy()
-    return bool(((point < lo - 1e-6) | (point > hi + 1e-6)).any())
-
-
 def test_pieces_cover_each_ray_from_where_it_leaves_the_box_to_infinity():
-    origins, directions = rays()
+    (origins, directions), (lo, hi) = rays(), BOX.double().numpy()
     cut = surroundings().segments(origins, directions)
     for number in range(len(origins)):
         own = cut.ray == number
@@ -50,7 +45,7 @@ def test_pieces_cover_each_ray_from_where_it_leaves_the_box_to_infinity():
         covered = []
         for distance in np.geomspace(0.01, 1e4, 60):
             point = origins[number].double().numpy() + distance * directions[number].double().numpy()
-            if not outside(point):
+            if ((point >= lo - 1e-6) & (point <= hi + 1e-6)).all():
                 continue
             place = in_lattice(point)
             along = np.clip(((place - starts) * ways).sum(1), 0.0, lengths)

@@ -19,7 +19,7 @@ from thermoxels_ns.heat.run import (
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import OUTSIDE, InsideAir, OutsideAir
 from thermoxels_ns.heat.solving import Goals
-from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
+from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = {"*": CONCRETE}
 AIRS = {"inside_air": InsideAir(20.0, "iso-6946-combined"), "outside_air": OutsideAir(0.0, "iso-6946-combined")}
@@ -71,13 +71,7 @@ def test_the_rim_of_a_hole_is_no_spot_of_the_inner_surface() -> None:
 def test_a_room_without_a_floor_is_named() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
     assert inner_surface_warnings(scene, room(), Z_UP) == ((), ())
-    mesh = room()
-    floor = (facet_normals(mesh.points_m, mesh.facets)[:, 2] > 0.5) & np.char.startswith(
-        np.array(mesh.boundary.patch_names)[mesh.boundary.patch], "interior"
-    )
-    names = (*mesh.boundary.patch_names, "floor")
-    patch = np.where(floor, len(names) - 1, mesh.boundary.patch)
-    missing = replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names))
+    missing = with_named_patch(room(), "interior-up", "floor")
     cellar = replace(scene, adiabatic=("floor",))  # no air touches it, and yet it is a floor
     assert inner_surface_warnings(cellar, missing, Z_UP) == ((), ())
     air = scene.outside_air

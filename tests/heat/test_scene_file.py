@@ -75,25 +75,33 @@ def test_all_effects() -> None:
 
 
 def test_what_a_file_may_say(tmp_path) -> None:
+    """Numbers may have units as in conditions of an audit, a comma, or the form 1e1, which yaml takes for a text."""
     found = scene(
         tmp_path,
         """
 materials:
   "*": brick
-  slab: {conductivity_w_mk: 2.3, density_kg_m3: 2300, specific_heat_j_kgk: 1000}
-initial: {temperature_c: 12}
-time: {duration_s: 600}
+  slab:
+    conductivity_w_mk: 0,8 W/(m K)
+    density_kg_m3: 1500 kg/m3
+    specific_heat_j_kgk: 0.9 kJ/(kg K)
+time: {duration_s: 24 h}
+initial: {temperature_c: 288.15 K}
 convection:
   - {patches: [interior-up, stairs], coefficient_w_m2k: 7.7, air_c: 15}
-sun: {towards: [0, -1, 1], direct_w_m2: 700, diffuse_w_m2: 80}
-surfaces: [{absorptivity: 0.5}]
+outside_air: {air_c: "-5,5 °C", coefficient: iso-6946-convection, wind_m_s: 3.6 km/h}
+ground: {surface_c: 1e1, reflectance: 20 %}
+surfaces: [{emissivity: 90 %, absorptivity: 0.6}]
+sun: {towards: [0, -1, 1], direct_w_m2: 500 W/m2, diffuse_w_m2: 80}
 adiabatic: []
 """,
     )
-    assert found.materials["slab"].name == "slab"
-    assert found.materials["slab"].heat_capacity_j_m3k == 2.3e6
-    assert found.initial_c == 12.0
-    assert found.time == AdaptiveSteps(600.0)
+    assert (found.outside_air.air_c, found.outside_air.wind_m_s) == (-5.5, pytest.approx(1.0))
+    assert (found.time, found.initial_c) == (AdaptiveSteps(86400.0), pytest.approx(15.0))
+    assert (found.ground.surface_c, found.ground.reflectance, found.surfaces[0].emissivity) == (10.0, 0.2, 0.9)
+    made = found.materials["slab"]
+    assert (made.conductivity_w_mk, made.density_kg_m3, made.specific_heat_j_kgk) == (0.8, 1500.0, 900.0)
+    assert (made.name, made.heat_capacity_j_m3k) == ("slab", 1.35e6)
     assert found.convection[0].where == ("interior-up", "stairs")
     assert found.sun is not None and found.sun.towards == (0.0, -1.0, 1.0)
     assert found.adiabatic == ()
@@ -189,10 +197,8 @@ def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_p
     for hours, air_c in ((0.0, -4.0), (1.0, 1.0), (2.0, 6.0), (20.0, 6.0)):
         assert values_at(outside.air_c, places, 3600.0 * hours) == pytest.approx(air_c)
         assert values_at(sky.surroundings_c, places, 3600.0 * hours) == pytest.approx(air_c - 20.0)
-    varying = outside.air_c
-    assert (
-        isinstance(varying, Varying) and varying.in_time and varying.resolution_s == 7200.0
-    )  # no step is longer than the file's shortest interval
+    assert isinstance(outside.air_c, Varying) and outside.air_c.in_time
+    assert outside.air_c.resolution_s == 7200.0  # no step is longer than the file's shortest interval
 
 
 @pytest.mark.parametrize(("year", "day"), [(2026, 0), (2024, 1)])
@@ -233,31 +239,6 @@ def test_a_series_needs_a_file_and_time(tmp_path) -> None:
     (tmp_path / "outside.csv").unlink()
     with pytest.raises(HeatError, match=r"air_series: .*outside\.csv: expected"):
         found.effects(room())
-
-
-def test_numbers_may_have_units_as_in_the_conditions_of_an_audit(tmp_path) -> None:
-    """And a comma, or the form 1e1, which yaml takes for a text."""
-    found = scene(
-        tmp_path,
-        """
-materials:
-  "*":
-    conductivity_w_mk: 0,8 W/(m K)
-    density_kg_m3: 1500 kg/m3
-    specific_heat_j_kgk: 0.9 kJ/(kg K)
-time: {duration_s: 24 h}
-initial: {temperature_c: 288.15 K}
-outside_air: {air_c: "-5,5 °C", coefficient: iso-6946-convection, wind_m_s: 3.6 km/h}
-ground: {surface_c: 1e1, reflectance: 20 %}
-surfaces: [{emissivity: 90 %, absorptivity: 0.6}]
-sun: {towards: [0, -1, 1], direct_w_m2: 500 W/m2}
-""",
-    )
-    assert (found.outside_air.air_c, found.outside_air.wind_m_s) == (-5.5, pytest.approx(1.0))
-    assert (found.time.duration_s, found.initial_c) == (86400.0, pytest.approx(15.0))
-    assert (found.ground.surface_c, found.ground.reflectance, found.surfaces[0].emissivity) == (10.0, 0.2, 0.9)
-    made = found.materials["*"]
-    assert (made.conductivity_w_mk, made.density_kg_m3, made.specific_heat_j_kgk) == (0.8, 1500.0, 900.0)
 
 
 AREA_X, VOLUME = 0.3 * 0.2, 0.4 * 0.3 * 0.2

@@ -118,10 +118,10 @@ def test_resume_goes_on_from_the_checkpoint(trained: Trained, tmp_path):
         *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "19", "--load-dir", str(early)),
         *("thermal-data", "--data", str(trained.scene)),
     )
-    whole = torch.load(trained.checkpoints / "step-000000039.ckpt", weights_only=False)["pipeline"]
-    resumed = torch.load(
-        tmp_path / "again" / "thermoxels" / "run" / "nerfstudio_models" / "step-000000039.ckpt", weights_only=False
-    )["pipeline"]
+    again = tmp_path / "again" / "thermoxels" / "run" / "nerfstudio_models"
+    whole, resumed = (
+        torch.load(at / "step-000000039.ckpt", weights_only=False)["pipeline"] for at in (trained.checkpoints, again)
+    )
     assert set(whole) == set(resumed)
     for name, tensor in whole.items():
         assert torch.equal(tensor, resumed[name]), name

@@ -85,12 +85,10 @@ def test_counts_without_unit_wrong_shapes_unknown_suffixes_and_pages_are_refused
     np.save(tmp_path / "row.npy", np.ones(4))
     np.save(tmp_path / "none.npy", np.ones((0, 3)))
     for name, unit, said in (
-        *(("a.png", CELSIUS, r"a\.png.*temperature_bounds\.json"), ("a.seq", CELSIUS, r"\.npy")),
-        *(
-            ("two.tiff", COUNTS, "2 pages"),
-            ("row.npy", CELSIUS, "height, width"),
-            ("none.npy", CELSIUS, "height, width"),
-        ),
+        ("a.png", CELSIUS, r"a\.png.*temperature_bounds\.json"),
+        ("a.seq", CELSIUS, r"\.npy"),
+        ("two.tiff", COUNTS, "2 pages"),
+        *((name, CELSIUS, "height, width") for name in ("row.npy", "none.npy")),
     ):
         with pytest.raises(ThermalFileError, match=said):
             read_thermal_file(tmp_path / name, unit)

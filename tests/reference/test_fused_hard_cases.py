@@ -74,8 +74,7 @@ def test_nan_density_is_refused_not_made_transparent(renderer, activation):
 
 def test_transmittance_keeps_its_digits_over_512_samples():
     """Behind an optical depth of 30 each weight is far below what 1 - accumulation can hold in single precision."""
-    grid = random_grid(0, 0, "relu", 1.0, TUBE)
-    grid.density.data.fill_(0.04)
+    grid = filled(0.04, TUBE)
     grid.density.data[:4] = 60.0
     single = sample_rays(grid, ALONG, RenderOptions(), "fused")
     exact = sample_rays(as_double(grid), in_double(ALONG), RenderOptions(), "reference")
@@ -91,8 +90,7 @@ def test_transmittance_keeps_its_digits_over_512_samples():
 
 def test_vanishing_density_keeps_value_and_gradient():
     """1 - exp(-1e-8) is 0 in single precision; a renderer that computes it so has a plateau without gradient."""
-    grid = random_grid(0, 0, "relu", 1.0, TUBE)
-    grid.density.data.fill_(1e-9)
+    grid = filled(1e-9, TUBE)
     reference = assert_twins_agree(grid, ALONG, RenderOptions())
     assert float(reference.values["accumulation"]) == pytest.approx(256e-9, rel=1e-6)
     for renderer in RENDERERS:

@@ -30,20 +30,16 @@ from thermoxels_ns.render.renderers import sample_rays
 ACTIVATIONS = ("relu", "softplus", "exp")
 
 
-def with_variation(grid, options=EVERYTHING) -> RenderOptions:
-    """The options with total variation of a block in the middle for all parameters."""
-    count = len(grid.voxels)
-    return replace(options, variation={name: (count // 4, count // 2) for name in grid.row_parameters()})
-
-
 @pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize(
     ("sh_degree", "temperature_degree"), itertools.product((None, 0, 1, 2), (0, 1)), ids=lambda d: f"degree {d}"
 )
 def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
+    """With total variation of a block in the middle for all parameters."""
     grid = random_grid(sh_degree, temperature_degree, activation, kept)
-    reference = assert_twins_agree(grid, random_request(grid), with_variation(grid))
+    block = dict.fromkeys(grid.row_parameters(), (len(grid.voxels) // 4, len(grid.voxels) // 2))
+    reference = assert_twins_agree(grid, random_request(grid), replace(EVERYTHING, variation=block))
     assert all(float(g.norm()) > 0 for g in reference.gradients.values())
 
 

@@ -115,19 +115,14 @@ def box_mesh(
         used, numbers = np.unique(tets[kept], return_inverse=True)
         points, tets, region = points[used], numbers.reshape(-1, 4), region[kept]
     mesh = mesh_from(points, tets, temperature_c, region=region, region_names=names)
-    return replace(mesh, boundary=_tags(points, mesh.facets, axes, patches or {}))
-
-
-def _tags(points, facets, axes, patches) -> Boundary:
-    corner, normal = points[facets], facet_normals(points, facets)
-    centroid = corner.mean(axis=1)
-    names = (*SIDES, "other", *(name for name in patches if name not in SIDES))
-    patch = np.full(len(facets), names.index("other"))
+    corner, normal, rules = points[mesh.facets], facet_normals(points, mesh.facets), patches or {}
+    names = (*SIDES, "other", *(name for name in rules if name not in SIDES))
+    patch = np.full(len(corner), names.index("other"))
     for side, (axis, end) in zip(SIDES, ((axis, end) for axis in range(3) for end in (0, -1))):
         patch[(corner[..., axis] == axes[axis][end]).all(axis=1)] = names.index(side)
-    for name, rule in patches.items():
-        patch[rule(centroid, normal)] = names.index(name)
-    return Boundary(np.ones(len(facets), bool), patch, names)
+    for name, rule in rules.items():
+        patch[rule(corner.mean(axis=1), normal)] = names.index(name)
+    return replace(mesh, boundary=Boundary(np.ones(len(corner), bool), patch, names))
 
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

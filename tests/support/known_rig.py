@@ -37,9 +37,11 @@ class KnownCapture:
 
     def projection_error_px(self, found: RigEstimate) -> float:
         """Median distance of where scene points fall from where they should [thermal pixels]."""
-        return projection_difference_px(
-            self.frames, (self.thermal, self.visible_to_thermal), (found.thermal_camera, found.visible_to_thermal)
-        )
+        points = np.concatenate([frame.points for frame in self.frames])
+        rigs = (self.thermal, self.visible_to_thermal), (found.thermal_camera, found.visible_to_thermal)
+        pixels = [camera.project(points @ rig[:3, :3].T + rig[:3, 3]) for camera, rig in rigs]
+        inside = self.thermal.contains(pixels[0])
+        return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)[inside]))
 
 
 def changes_between(start: RigEstimate, camera: Camera, transform: FloatArray) -> FloatArray:
@@ -50,16 +52,6 @@ def changes_between(start: RigEstimate, camera: Camera, transform: FloatArray) -
     growth = np.log(camera.fl_x / before.fl_x)
     lens = growth, camera.cx - before.cx, camera.cy - before.cy, camera.k1 - before.k1
     return np.array([*angles, *shift, *lens], dtype=np.float64)
-
-
-def projection_difference_px(
-    frames: list[RigFrame], first: tuple[Camera, FloatArray], second: tuple[Camera, FloatArray]
-) -> float:
-    """Median distance between where two rigs (camera, visible to thermal) put the frames' points [pixels]."""
-    points = np.concatenate([frame.points for frame in frames])
-    pixels = [camera.project(points @ rig[:3, :3].T + rig[:3, 3]) for camera, rig in (first, second)]
-    inside = first[0].contains(pixels[0])
-    return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)[inside]))
 
 
 def turned(x_deg: float, y_deg: float, z_deg: float) -> FloatArray:
@@ -166,7 +158,7 @@ def painted_sky() -> KnownCapture:
         points = 10.0 * visible.rays(pixels)
         ids = np.arange(len(points)) + number * len(points)
         frames.append(RigFrame(photograph, temperature_c.astype(np.float32), points, ids))
-    return KnownCapture(frames, plain, thermal, rig, np.zeros(views), (0.0, 0.0))
+    return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
 
 
 def _seen(paint: npt.NDArray[np.float32], camera: Camera, turn: FloatArray, samples: int) -> npt.NDArray:

@@ -191,9 +191,8 @@ def test_voxels_that_fewer_than_two_photographs_show_go(narrow):
 
 def test_where_no_two_photographs_show_anything_of_the_box_air_goes_all_the_same():
     model = model_of(prune_threshold=0.0)
-    points = np.column_stack(
-        (np.full(25, 0.9), *(part.ravel() for part in np.meshgrid(*2 * [np.linspace(-0.9, 0.9, 5)])))
-    )
+    side = np.linspace(-0.9, 0.9, 5)
+    points = np.stack(np.meshgrid([0.9], side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     model.feature_rays = FeatureRays(np.tile([-0.9, 0.0, 0.0], (25, 1)), np.arange(25), points, np.zeros(25))
     given: Any = attributes(model, 10)
     given.pipeline.datamanager.views.camera_to_world[:, :, [0, 2]] *= -1.0

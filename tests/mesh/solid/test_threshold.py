@@ -154,9 +154,8 @@ class Layers:
     def half_way(self) -> float:
         """Where rays have spent half of their weight, [voxels] along x, integrated finely."""
         x = np.linspace(16.0, 0.0, 160_001)
-        taken = (
-            np.cumsum(np.exp(np.minimum(np.interp(x, np.arange(17), self.logarithm), 15.0))) * LAYERS.voxel_size * 1e-4
-        )
+        density = np.exp(np.minimum(np.interp(x, np.arange(17), self.logarithm), 15.0))
+        taken = np.cumsum(density) * LAYERS.voxel_size * 1e-4
         half = -np.log(0.5 + 0.5 * np.exp(-taken[-1]))
         return float(np.interp(half, taken, x))
 

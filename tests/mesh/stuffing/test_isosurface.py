@@ -106,6 +106,7 @@ def test_a_full_lattice_is_a_box_to_the_last_bit_also_one_voxel_wide(shape):
     assert quality.volume_m3 == pytest.approx(a * b * c, rel=1e-14)
     assert quality.area_m2 == pytest.approx(2 * (a * b + b * c + a * c), rel=1e-14)
     assert quality.dihedral_range_deg == pytest.approx((45.0, 90.0)) and full.on_box.all()
+    assert sharpen(full, shape) is full
     assert np.array_equal(full.points.min(axis=0), [0, 0, 0]) and np.array_equal(full.points.max(axis=0), shape)
     random = np.random.default_rng(6).normal(size=shape)
     random.flat[0] = 1.0
@@ -350,8 +351,3 @@ def test_edges_that_face_each_other_do_not_cross(seed):
     solid, sharp, nodes = sharpened(Shape(distance, 1.0, 1.0).level(CELLS, 1.0))
     assert len(nodes) > 100
     assert crossings(solid) == 0 and crossings(sharp) == 0
-
-
-def test_a_body_that_is_all_border():
-    solid = stuff(np.ones((3, 4, 5)))
-    assert sharpen(solid, (3, 4, 5)) is solid
