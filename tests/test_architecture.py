@@ -84,7 +84,7 @@ MOST_LINES = {
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 27300
+MOST_TEST_LINES = 27175
 
 
 def room_of(module: str) -> str:
