@@ -9,6 +9,7 @@ from tests.support.heat_bodies import mesh_from
 from tests.support.stuffed_shapes import random_turn, stiffness
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, count_overlaps, group_sides
+from thermoxels_ns.mesh.quality.tet_shapes import dihedral_cosines, edge_stiffness, flatness, signed_volumes
 from thermoxels_ns.mesh.temperature import tet_conductances
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
@@ -19,6 +20,13 @@ def crossed_diagonals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     number = {tuple(c): n for n, c in enumerate(corners.tolist())}
     mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
     return corners.astype(float), tets, np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
+
+
+@pytest.mark.parametrize("shape_of", [signed_volumes, flatness, dihedral_cosines, edge_stiffness])
+@pytest.mark.parametrize("node", [-1, 4])
+def test_a_node_that_is_not_there_is_not_read(shape_of, node):
+    with pytest.raises(IndexError, match="4 points"):
+        shape_of(np.eye(4)[:, :3], np.array([[0, 1, 2, node]]))
 
 
 def _turned_over(mesh):
