@@ -72,41 +72,43 @@ def stiffness_matrix(points_m: FloatArray, tets: IntArray, conductivity_w_mk: Fl
     [[3.0, -1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 1.0]]
     """
     num_nodes, entries = len(points_m), edge_stiffness(points_m, tets)
-    entries *= conductivity_w_mk[:, None]
-    start = np.zeros(num_nodes + 1, np.int32)
-    upper = sparse.csr_matrix((*_sums_at_edges(tets, entries, start), start), shape=(num_nodes, num_nodes))
+    start = np.minimum(np.arange(num_nodes + 1, dtype=np.int32), 1)
+    sums = _sums_at_edges(tets, entries, np.asarray(conductivity_w_mk, np.float64), start)
+    upper = sparse.csr_matrix((*sums, start), shape=(num_nodes, num_nodes))
     upper.sort_indices()
-    # A constant temperature has no gradient, so each row sums to 0.
-    diagonal = np.zeros(num_nodes)
-    diagonal -= np.asarray(upper.sum(axis=0)).ravel()
-    diagonal -= np.asarray(upper.sum(axis=1)).ravel()
-    return sparse.csr_matrix(upper + upper.T.tocsr() + sparse.diags(diagonal, format="csr"))
+    return sparse.csr_matrix(upper + upper.T.tocsr())
 
 
 @kernel
-def _sums_at_edges(tets: IntArray, entries: FloatArray, start: IntArray):
-    """Return data and column indices of the upper triangle of a CSR matrix: sums of `entries`, (t, 6), at each edge.
+def _sums_at_edges(tets: IntArray, entries: FloatArray, factors: FloatArray, start: IntArray):
+    """Return data and column indices of the upper triangle of a CSR matrix whose rows sum to 0 with its transpose's.
 
-    The row is the smaller node of an edge, the column the larger one. Columns of a row are not sorted; edges whose
-    entries are all 0 are left out. `start`, (n + 1,), must be 0 and is overwritten with the matrix's row pointer.
+    An entry is the sum of `entries`, (t, 6), times `factors`, (t,), at an edge. Its row is the smaller node, its column
+    the larger one. The diagonal is halved, since the transpose has it too. Columns of a row are not sorted; edges whose
+    entries are all 0 are left out. `start`, (n + 1,), must be 0, 1, ..., 1 and becomes the matrix's row pointer.
     """
     for t in range(len(tets)):
         for e in range(6):
             if entries[t, e] != 0.0:
                 start[min(tets[t, SHAPE_EDGES[e, 0]], tets[t, SHAPE_EDGES[e, 1]]) + 1] += 1
     start[:] = np.cumsum(start)
-    end, larger, sums = start[:-1].copy(), np.empty(start[-1], np.int32), np.zeros(start[-1])
+    end, larger, sums = start[:-1] + 1, np.empty(start[-1], np.int32), np.zeros(start[-1])
+    for node in range(len(end)):
+        larger[start[node]] = node
     for t in range(len(tets)):
         for e in range(6):
             if entries[t, e] != 0.0:
                 one, two = tets[t, SHAPE_EDGES[e, 0]], tets[t, SHAPE_EDGES[e, 1]]
                 node, other = min(one, two), max(one, two)
-                place = start[node]
+                place = start[node] + 1
                 while place < end[node] and larger[place] != other:
                     place += 1
                 if place == end[node]:
                     larger[place], end[node] = other, place + 1
-                sums[place] += entries[t, e]
+                entry = factors[t] * entries[t, e]
+                sums[place] += entry
+                sums[start[node]] -= 0.5 * entry
+                sums[start[other]] -= 0.5 * entry
     count = 0
     for node in range(len(end)):
         first, start[node] = start[node], count

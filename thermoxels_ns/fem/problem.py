@@ -214,7 +214,9 @@ class HeatProblem:
         with raising(HeatError):
             self.mesh.check()
         refuse_flat_tets(points, tets)
-        unused = len(points) - np.count_nonzero(np.bincount(tets.ravel(), minlength=len(points)))
+        used = np.zeros(len(points), bool)
+        used[tets] = True
+        unused = np.count_nonzero(~used)
         if unused:
             expected, got = "every node in at least one tetrahedron", f"{unused} of {len(points)} in none"
             remedy = "Remove the unused nodes; they have no heat capacity."
