@@ -72,7 +72,7 @@ MOST_LINES = {
     "evaluation": 385,
     "fem": 2635,
     "field": 880,
-    "heat": 2250,
+    "heat": 2530,
     "mesh": 4605,
     "multiview": 1735,
     "radiometry": 1215,

@@ -69,6 +69,11 @@ class Heat:
     """Effects that together bring less than this share of all heat that flows are left out; the report lists each with
     its watts at the solution. With 0, and with a tolerance, all effects that bring heat are used. Left out: 0.005, half
     the accuracy that building physics asks of a heat flow."""
+    engine: Literal["own", "dolfinx"] = "own"
+    """What solves: own, or dolfinx: DOLFINx and PETSc in processes of their own, for meshes of many million tetrahedra
+    (docs/heat.md says how to get it). It solves steady states and equal time steps, without a tolerance."""
+    ranks: int = 1
+    """Number of processes of the engine dolfinx, which mpirun starts; each holds a part of the mesh."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh, if the scene has none. Default: the direction in the
     summary.json beside the mesh, or else z."""
@@ -110,6 +115,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     """Read mesh and scene, compute the heat run and return it without writing files; errors: see `Heat.main`."""
+    from thermoxels_ns.heat.dolfinx_engine import DolfinxEngine
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
@@ -135,7 +141,10 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
     read_s = clock.perf_counter() - begin
-    run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, behind_m2k_w=behind, say=say)
+    engine = None if options.engine == "own" else DolfinxEngine(options.ranks, say)
+    run = run_scene(
+        scene, mesh, goals, up=up, probes_m=options.probes, export=export, behind_m2k_w=behind, say=say, engine=engine
+    )
     return replace(run, seconds={"read": read_s, **run.seconds})
 
 
@@ -240,7 +249,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     assert mesh is not None and scene is not None
     inputs = [mesh, mesh.with_name(f"{mesh.stem}-boundary.vtp"), Path(scene), *filter(None, [options.from_audit])]
     goals = options.tolerance, options.flow_tolerance, options.leave_out_below, options.memory_gb, options.allow_unmet
-    report = identify(inputs, scene, options.probes, options.up, *goals)
+    report = identify(inputs, scene, options.probes, options.up, options.engine, *goals)
     write_page(folder / PAGE, heat_page(run, drawn, mesh.name, command_of("heat", options), files, report))
     write_json(folder / ANSWERS, answers)
     say(f"Written to {folder}: {', '.join(files)}")

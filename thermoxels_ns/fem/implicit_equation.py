@@ -207,8 +207,12 @@ class ImplicitEquation:
         """The rows and columns of M / step + K + R that belong to free nodes, [W / K]."""
         self._solvers: dict[float, LinearSolver] = {}
 
-    def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
+    def solve(
+        self, start_k: Vector, time_s: float, given_w: Vector | None = None, found_k: Vector | None = None
+    ) -> ImplicitSolution:
         """Solve for T at `time_s`, given T_0 = `start_k`, (n,), [K], relative to `HeatSystem.reference_c`.
+
+        If `found_k` (n,) is given, it is T, found elsewhere, and only the heat balance is checked.
 
         `given_w`, (n,), [W], is the heat of earlier stages; None is 0. Emitted heat increases with the temperature and
         has a symmetric Jacobian, so the solution is the minimum of a convex energy. Newton's direction is a descent
@@ -219,9 +223,11 @@ class ImplicitEquation:
         fixed, nonlinear, change_k = self._system.fixed, self._system.nonlinear, np.zeros(self._system.num_nodes)
         if len(fixed.nodes):
             change_k[fixed.nodes] = fixed.temperature_k(time_s) - start_k[fixed.nodes]
+        if found_k is not None:
+            change_k = found_k - start_k
         rest = self._residual(start_k, change_k, time_s, given_w)
-        count, spent, settled = 0, 0, rest.is_round_off
-        status = "The temperature is level: nothing flows." if settled else ""
+        count, spent, settled = 0, 0, rest.is_round_off or found_k is not None
+        status = "The temperature is level: nothing flows." if rest.is_round_off else ""
         balanced = max(_BALANCED, _BALANCED_OVER_TOLERANCE * self._relative_tolerance)
         most = 0 if settled else MAX_ITERATIONS if nonlinear else MOST_CORRECTIONS
         tolerance = _NEWTON_TOLERANCE if nonlinear else self._relative_tolerance

@@ -11,14 +11,16 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
-from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.system import Engine, HeatSystem
 
 Vector = FloatArray
 
 OVERSHOOT_K = 0.01  # A temperature outside its range is reported if it is farther outside than this, [K]
 
 
-def solve_steady(problem: HeatProblem, *, order: int = 1, relative_tolerance: float = 1e-12) -> SteadySolution:
+def solve_steady(
+    problem: HeatProblem, *, order: int = 1, relative_tolerance: float = 1e-12, engine: Engine | None = None
+) -> SteadySolution:
     """Return the steady state of a problem: div(k grad T) + s = 0 with the source s, and the effects on the boundary.
 
     With linear tetrahedra without obtuse angles, only a flux or source can drive a temperature out of the range of the
@@ -30,6 +32,7 @@ def solve_steady(problem: HeatProblem, *, order: int = 1, relative_tolerance: fl
         order: 1 for linear tetrahedra, 2 for quadratic ones. Quadratic ones have eight times as many unknowns. Their
             error falls with the cube of the mesh size if the solution is smooth, but they may overshoot.
         relative_tolerance: Relative tolerance of the linear solver, and of Newton's method if there is radiation.
+        engine: Function that finds the temperatures in place of our own solver; None: our own.
 
     Raises:
         HeatError: A connected piece of the body has neither convection, radiation nor a fixed temperature, two effects
@@ -38,7 +41,8 @@ def solve_steady(problem: HeatProblem, *, order: int = 1, relative_tolerance: fl
     system = HeatSystem(problem, order=order)
     _check_held(system)
     equation = ImplicitEquation(system, 0.0, np.inf, relative_tolerance=relative_tolerance)
-    solution = equation.solve(system.start_k, 0.0)
+    found_k = None if engine is None else engine(system, np.zeros(1))[0]
+    solution = equation.solve(system.start_k, 0.0, found_k=found_k)
     if not solution.converged:
         raise HeatError(f"No steady state was found. {solution.status} Check the mesh's quality and the effects.")
     refuse_too_cold(system, solution.relative_k)

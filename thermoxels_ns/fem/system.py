@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -219,3 +220,8 @@ class HeatSystem:
             heat_w = form.part_heat_w(np.zeros(0), time_s)
             low, high = -np.inf if np.any(heat_w < 0.0) else low, np.inf if np.any(heat_w > 0.0) else high
         return low, high
+
+
+Engine: TypeAlias = Callable[[HeatSystem, FloatArray], FloatArray]
+"""Another solver: from a system of linear tetrahedra and the ends of the steps of backward Euler, (s + 1,), [s], or the
+one time 0 for the steady state, it returns the temperatures minus `HeatSystem.reference_c`, (s, n) or (1, n), [K]."""

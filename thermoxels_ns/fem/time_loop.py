@@ -16,7 +16,7 @@ from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect
 from thermoxels_ns.fem.steady import out_of_range, refuse_too_cold
-from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.system import Engine, HeatSystem
 
 Vector = FloatArray
 Progress = Callable[[float, int], None]
@@ -95,15 +95,20 @@ class RungeKutta:
         self.system, self._scheme, self._relative_tolerance = system, scheme, relative_tolerance
         self._kept: tuple[float, float, ImplicitEquation] | None = None
 
-    def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Return a step of length `step_s` from `start_k`, (n,), [K], minus the reference, at time `time_s`. The error
-        is estimated if `estimate` is True. Raises `HeatError` if a stage does not converge."""
+    def step(
+        self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False, found_k: Vector | None = None
+    ) -> Step:
+        """Return a step of length `step_s` from `start_k`, (n,), [K], minus the reference, at time `time_s`.
+
+        The error is estimated if `estimate` is True. `found_k` (n,) are the temperatures at the end of a step of
+        backward Euler if they were found elsewhere. Raises `HeatError` if a stage does not converge.
+        """
         system, scheme, nothing_w = self.system, self._scheme, np.zeros(self.system.num_nodes)
         states, inner_w, solutions = list[Vector](), list[Vector](), []
         for row, node, implicit in zip(scheme.weights, scheme.nodes, np.diag(scheme.weights)):
             now_s = time_s + node * step_s
             given_w = sum((weight / implicit * flow_w for weight, flow_w in zip(row, inner_w)), nothing_w)
-            solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
+            solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w, found_k)
             if not solution.converged:
                 remedy = "Use shorter steps or check the mesh's quality."
                 raise HeatError(f"The step from {time_s:.6g} s failed. {solution.status} {remedy}")
@@ -167,6 +172,7 @@ def solve_heat(
     relative_tolerance: float = 1e-12,
     estimate_steps: bool = False,
     progress: Progress | None = None,
+    engine: Engine | None = None,
 ) -> HeatSolution:
     """Return the temperatures of a body through time, and the heat that each effect brings.
 
@@ -182,6 +188,7 @@ def solve_heat(
         estimate_steps: Also estimate the error of equal steps (`time_error_k`) by a solution with steps twice as long,
             which takes half as long again. Adaptive steps always have an estimate, given steps never.
         progress: Called after every step with the share of the duration that is done and the number of steps.
+        engine: Function that finds the temperatures of equal or given steps of backward Euler; None: our own solver.
 
     Raises:
         HeatError: An effect does not fit the mesh, a material's heat capacity is below `LEAST_CAPACITY_J_M3K`, a step's
@@ -198,7 +205,9 @@ def solve_heat(
         steps = _adaptive_steps(balance, time, relative_tolerance)
     else:
         lengths_s = time if isinstance(time, np.ndarray) else np.full(time.steps, time.step_seconds)
-        steps = _given_steps(balance, RungeKutta(balance.system, scheme, relative_tolerance), lengths_s)
+        kutta = RungeKutta(balance.system, scheme, relative_tolerance)
+        found = None if engine is None else engine(balance.system, times_s)
+        steps = _given_steps(balance, kutta, lengths_s, found)
     for done_s in steps:
         if progress is not None:
             progress(done_s / float(times_s[-1]), balance.steps)
@@ -214,7 +223,7 @@ def solve_heat(
     if time.steps >= 2:
         twice_s = np.full(time.steps // 2, 2.0 * time.step_seconds)
         with suppress(HeatError):
-            doubled = solve_heat(problem, twice_s, scheme=scheme, relative_tolerance=relative_tolerance)
+            doubled = solve_heat(problem, twice_s, scheme=scheme, relative_tolerance=relative_tolerance, engine=engine)
             apart_k = np.abs(found.temperature_c[: 2 * doubled.steps + 1 : 2] - doubled.temperature_c).max(axis=1)
             most_k, last_k = (float(part) / (2.0**scheme.order - 1.0) for part in (apart_k.max(), apart_k[-1]))
             said = f" The steps make an error of about {most_k:.2g} K at most and {last_k:.2g} K at the end (from steps"
@@ -223,12 +232,17 @@ def solve_heat(
     return replace(found, status=f"{found.status} The error of the steps is not estimated: {why}.")
 
 
-def _given_steps(balance: HeatBalance, kutta: RungeKutta, lengths_s: Vector) -> Iterator[float]:
-    """Add steps of given lengths, [s], to `balance`, and yield the time, [s], at the end of each step. Raises
-    `HeatError` if a step's solver does not converge."""
+def _given_steps(
+    balance: HeatBalance, kutta: RungeKutta, lengths_s: Vector, found_k: FloatArray | None = None
+) -> Iterator[float]:
+    """Add steps of given lengths, [s], to `balance`, and yield the time, [s], at the end of each step.
+
+    `found_k` (s, n) are the temperatures at the ends if they were found elsewhere. Raises `HeatError` if a step's
+    solver does not converge.
+    """
     relative_k = balance.start_k
-    for now_s, step_s in zip(balance.times_s.tolist(), lengths_s.tolist()):
-        step = kutta.step(relative_k, now_s, step_s)
+    for number, (now_s, step_s) in enumerate(zip(balance.times_s.tolist(), lengths_s.tolist())):
+        step = kutta.step(relative_k, now_s, step_s, found_k=None if found_k is None else found_k[number])
         balance.add(step, step_s, ends_interval=True)
         relative_k = step.relative_k
         yield now_s + step_s

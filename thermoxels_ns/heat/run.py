@@ -20,6 +20,7 @@ from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
+from thermoxels_ns.fem.system import Engine
 from thermoxels_ns.fem.tolerance import ToleratedSolution
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.results import (
@@ -145,12 +146,14 @@ def run_scene(
     export: Mapping[str, Any] | None = None,
     behind_m2k_w: Mapping[str, float] | None = None,
     say: Say = lambda _: None,
+    engine: Engine | None = None,
 ) -> HeatRun:
     """Return the solution of a scene on a mesh, with results and warnings.
 
     `goals` are the allowed errors and memory. The direction `up` is used if the scene has none; None: z. Temperatures
     are recorded at `probes_m`, shape (p, 3), [m]. `export`, the summary of the export that wrote the mesh, adds
     warnings. `behind_m2k_w` is the argument of `with_layers`; None: no layers. `say` is called with lines of progress.
+    An `engine` finds the temperatures in place of our own solver.
     Raises `HeatError` if the scene does not fit the mesh, a probe lies outside it, or the solver fails.
     """
     start, scene = clock.perf_counter(), scene.on(mesh)
@@ -169,7 +172,7 @@ def run_scene(
     warnings = (*unfit, *harmless, *about_scene, *body_warnings(mesh), *shell_warnings(scene, export or {}))
     for warning in warnings:
         say(f"Warning: {warning}")
-    found = solve_problem(problem, scene.time, goals, say)
+    found = solve_problem(problem, scene.time, goals, say, engine)
     solution, solved = found.solution, found.problem
     done = clock.perf_counter()
     seconds = {"solve": done - start}

@@ -16,6 +16,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, eff
 from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.system import Engine
 from thermoxels_ns.fem.time_loop import Progress, solve_heat
 from thermoxels_ns.fem.tolerance import (
     Goals,
@@ -55,15 +56,26 @@ class SolvedProblem:
     accuracy: ToleratedSolution | None  # The solution with estimated errors; None without a tolerance
 
 
-def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
+def solve_problem(
+    problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None, engine: Engine | None = None
+) -> SolvedProblem:
     """Return the solution of a problem without its negligible effects; `say` is called with lines of progress.
+
+    An `engine` finds steady states, and equal steps, of the given mesh in place of our own solver.
 
     Effects that bring little heat at the extreme temperatures of start and surroundings are left out at first. The heat
     that they would bring is then computed at the solution. If it exceeds `goals.left_out_share` of all heat, or if no
     solution was found, the problem is solved again with all effects.
 
-    Raises `HeatError` if more memory than allowed is needed, the solver fails, or the tolerance cannot be met.
+    Raises `HeatError` if more memory than allowed is needed, the solver fails, the tolerance cannot be met, or the
+    engine cannot follow what is asked.
     """
+    if engine is not None and (goals.estimated or isinstance(time, AdaptiveSteps)):
+        got = "a tolerance" if goals.estimated else "steps whose length follows from a tolerance"
+        remedy = (
+            "Leave out --engine, or --tolerance and --flow-tolerance, and give the scene time: {steps, step_seconds}."
+        )
+        raise HeatError("engine", expected="a steady state or equal steps, without a tolerance", got=got, remedy=remedy)
     if not goals.estimated:
         needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
         say(f"Memory: about {describe_bytes(needed)} at most.")
@@ -77,7 +89,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         shown = ", ".join(label for n, label in enumerate(labels) if n not in left)
         say(f"Effects: {shown or 'none, so no heat crosses the surface'}.")
         try:
-            found = _solve(kept, time, goals, say)
+            found = _solve(kept, time, goals, say, engine)
         except HeatError:
             if not left:
                 raise
@@ -144,11 +156,11 @@ def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray
     return largest
 
 
-def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedProblem:
+def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say, engine: Engine | None) -> SolvedProblem:
     if not goals.estimated:
         if time is None:
-            return SolvedProblem(problem, solve_steady(problem), (), None)
-        solution = solve_heat(problem, time, estimate_steps=True, progress=_progress(say))
+            return SolvedProblem(problem, solve_steady(problem, engine=engine), (), None)
+        solution = solve_heat(problem, time, estimate_steps=True, progress=_progress(say), engine=engine)
         return SolvedProblem(problem, solution, (), None)
     found = solve_to_tolerance(problem, goals, time, log=say, progress=_progress(say))
     return SolvedProblem(found.problem, found.solution, (), found)
