@@ -48,7 +48,7 @@ def test_every_option_in_a_remedy_is_one_of_a_command(monkeypatch):
     config = deepcopy(thermoxels.config)
     there = options_of(type(config), [], default=config) | options_of(type(config), ["thermal-data"], default=config)
     there |= options_of(ExportThermoxelsMesh, [])
-    for name in ("capture", "demo", "synthetic", "cost", "heat", "audit"):
+    for name in ("capture", "demo", "synthetic", "cost", "heat", "audit", "batch", "split"):
         there |= options_of(cli.Commands, [name])
     advised = advice()
     assert len(advised) > 50

@@ -18,6 +18,7 @@ from thermoxels_ns.commands.capture import Capture
 from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.commands.split import Split
 from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import ThermoxelsError, exit_status
 from thermoxels_ns.data.layouts import LayoutName
@@ -74,6 +75,7 @@ Commands = tyro.conf.FlagConversionOff[
         Annotated[Heat, tyro.conf.subcommand(name="heat")],
         Annotated[Audit, tyro.conf.subcommand(name="audit")],
         Annotated[Batch, tyro.conf.subcommand(name="batch")],
+        Annotated[Split, tyro.conf.subcommand(name="split")],
     ]
 ]
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, MeshError, ThermoxelsError
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.build import BuiltMesh
     from thermoxels_ns.mesh.quality.checks import MeshFigures
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
-    from thermoxels_ns.multiview.stereo import Depths
 
 Say = Callable[[str], None]
 
@@ -110,6 +109,15 @@ class TrainedScene:
     dataset: Any  # Training photographs, a `ThermalDataset`; None: support of the surface is not counted
     tracks: FeatureRays | None  # Lines from photographs to points that the photographs show, in the trained scene
     corrections: dict[str, Any]  # Result of `ThermoxelsPipeline.corrections`
+    blocks: tuple[Block, ...] = ()  # The trained scenes that this scene was joined of; empty: none
+
+
+class Block(NamedTuple):
+    """A trained scene that is a part of a larger one."""
+
+    run: TrainedScene
+    shift: FloatArray  # Where its origin lies in the larger scene, shape (3,), [world units]
+    cells: BoolArray  # Voxels of the larger scene that are this block's, shape `lattice.cell_shape`
 
 
 @dataclass(frozen=True)
@@ -133,6 +141,8 @@ class ExportThermoxelsMesh(ExportOptions):
     """The config.yml that ns-train wrote."""
     output_dir: Path
     """Folder for the results; made if it does not exist."""
+    beside: tuple[Path, ...] = ()
+    """The config.yml of each further block of a scene that thermoxels split cut: all blocks become one mesh."""
 
     def main(self) -> None:
         """Run the export; raises `ThermoxelsError` for wrong options, an unusable run, or if nothing is solid."""
@@ -140,8 +150,11 @@ class ExportThermoxelsMesh(ExportOptions):
         with threadpool_limits(1, "blas"):
             check_options(self)
             prepare_folder(self.output_dir)
-            print(f"Loading {self.load_config}", flush=True)
-            export_scene(load_trained_scene(self.load_config), self, self.output_dir, partial(print, flush=True))
+            runs = list[TrainedScene]()
+            for config in (self.load_config, *self.beside):
+                print(f"Loading {config}", flush=True)
+                runs.append(load_trained_scene(config))
+            export_scene(joined_scene(runs), self, self.output_dir, partial(print, flush=True))
 
 
 def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, SceneScale | None]:
@@ -184,11 +197,9 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     """
     from thermoxels_ns.mesh.build import build_mesh
     from thermoxels_ns.mesh.quality.checks import check_mesh
-    from thermoxels_ns.multiview.photographs import read_photographs
-    from thermoxels_ns.multiview.stereo import depths_of
 
     selection, rules, distance = check_options(options)
-    scene_file, lattice = scene_json(run.scene_folder)[1], run.snapshot.lattice
+    scene_file = scene_json(run.scene_folder)[1]
     scale = choose_scale(options.metres_per_unit, distance, scene_file)
     needs = ["--formats inp"] * ("inp" in options.formats) + ["--wall-thickness"] * (options.wall_thickness is not None)
     needs += ["--patches"] * (options.patches is not None)
@@ -206,8 +217,7 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
     built = build_mesh(run.snapshot, selection, to_mesh, options.boundary, up=up, rules=rules, metres_per_unit=metres)
     if run.dataset is not None:
-        depths = depths_of(read_photographs(run.dataset), lattice.lo, lattice.hi)
-        built = with_support(built, depths, run, to_mesh)
+        built = with_support(built, run, to_mesh)
     unit = "input unit" if scale is None else "m"
     return SceneMesh(built, check_mesh(built.mesh), scale, unit, to_mesh, up, up_source)
 
@@ -304,24 +314,54 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
 
 
-def with_support(built: BuiltMesh, depths: Depths, run: TrainedScene, to_mesh: FloatArray) -> BuiltMesh:
+def with_support(built: BuiltMesh, run: TrainedScene, to_mesh: FloatArray) -> BuiltMesh:
     """Return `built` with the counts of photographs that see and that support each triangle, `Boundary.photographs`.
 
-    `to_mesh`, (4, 4), transforms the trained scene to the mesh. See `facet_views` and `supporting_photographs`.
+    `to_mesh`, (4, 4), transforms the trained scene to the mesh. In a block's voxels, the photographs of this block are
+    counted. See `facet_views` and `supporting_photographs`.
     """
     from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.mesh.solid.free_space import facet_views
+    from thermoxels_ns.multiview.photographs import read_photographs
+    from thermoxels_ns.multiview.stereo import depths_of
     from thermoxels_ns.multiview.votes import supporting_photographs
 
     mesh, lattice = built.mesh, run.snapshot.lattice
-    middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
-    normal = facet_normals(mesh.points_m, mesh.facets) @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
-    photographs = depths.photographs
-    cameras = photographs.matrices, photographs.centres, photographs.sizes
-    views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
-    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, run.tracks)
-    count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
-    return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
+    every = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
+    turned = to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
+    normal, counts = facet_normals(mesh.points_m, mesh.facets) @ turned, np.zeros((len(every), 2), np.int64)
+    cell = np.floor(lattice.world_to_index(every)).astype(np.int64)
+    cell = tuple(np.clip(cell, 0, np.array(lattice.cell_shape) - 1).T)
+    for block, shift, cells in run.blocks or [Block(run, np.zeros(3), np.ones(lattice.cell_shape, bool))]:
+        depths = depths_of(read_photographs(block.dataset), block.snapshot.lattice.lo, block.snapshot.lattice.hi)
+        seen = depths.photographs.moved(shift)
+        own = np.flatnonzero(cells[cell])
+        views = facet_views(
+            built.solid.cells, lattice, seen.matrices, seen.centres, seen.sizes, every[own], normal[own]
+        )
+        tracks = None if block.tracks is None else block.tracks.moved(np.eye(3), shift, 1.0)
+        found = supporting_photographs(
+            replace(depths, photographs=seen), views.middle, views.seen, lattice.voxel_size, tracks
+        )
+        counts[own] = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
+    return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=counts)))
+
+
+def joined_scene(runs: Sequence[TrainedScene]) -> TrainedScene:
+    """Return one trained scene of blocks, in the world of the first; one alone is returned as it is.
+
+    Raises `MeshError` unless the blocks' voxels coincide, see `joined_fields.joined`.
+    """
+    if len(runs) == 1:
+        return runs[0]
+    from thermoxels_ns.mesh.joined_fields import joined
+
+    into = np.linalg.inv(runs[0].world_to_input)
+    shifts = np.stack([(into @ run.world_to_input)[:3, 3] for run in runs])
+    snapshot, owner = joined([run.snapshot for run in runs], shifts)
+    blocks = tuple(Block(run, shift, owner == number) for number, (run, shift) in enumerate(zip(runs, shifts)))
+    corrections = {f"block {number + 1}": run.corrections for number, run in enumerate(runs)}
+    return replace(runs[0], snapshot=snapshot, corrections=corrections, blocks=blocks)
 
 
 def _against_truth(run: TrainedScene, made: SceneMesh, say: Say) -> dict[str, Any] | None:

@@ -218,7 +218,7 @@ class ThermalDataParser(DataParser):
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
-        pixel_size = found.pixel_size(file.frames)
+        pixel_size = float(file.meta.get("pixel_size") or found.pixel_size(file.frames))  # given in blocks of a scene
         if math.isinf(pixel_size):
             expected = f"photographs that look at the scene box, from {found.source}"
             remedy = (

@@ -61,7 +61,7 @@ class FoundBox:
         frames = _spread(frames, _MOST_PHOTOGRAPHS)
         if not len(points):
             return float("inf")
-        depth = _depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
+        depth = depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
         sizes = depth / np.array([[f.intrinsics.fl_x] for f in frames])
         return float(np.quantile(sizes[np.isfinite(sizes)], quantile)) if np.isfinite(sizes).any() else float("inf")
 
@@ -125,7 +125,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
-    depth = _depths_in_view(points, frames)
+    depth = depths_in_view(points, frames)
     seen = np.isfinite(depth)
     ahead = np.array([np.median(row[known]) if known.any() else np.nan for row, known in zip(depth, seen)])
     views = Views.of([frame.intrinsics for frame in frames], [frame.pose for frame in frames])
@@ -148,7 +148,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     return _checked(np.stack([low, high]), "box of the points")
 
 
-def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
+def depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
     """Return the depth of each point in each photograph, (photographs, points); NaN for a point that is not in view."""
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):

@@ -43,6 +43,12 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.matrices)
 
+    def moved(self, shift: FloatArray) -> Photographs:
+        """Return the same photographs in a world in which all places lie farther on by `shift` (3,), [world units]."""
+        matrices = self.matrices.copy()
+        matrices[:, :, 3] -= self.matrices[:, :, :3] @ shift
+        return replace(self, matrices=matrices, centres=self.centres + shift)
+
     def of_pixels(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return camera centres, and directions of depth 1, of the pixels `chosen` (n,), both (n, 3), world axes."""
         number = np.searchsorted(self.firsts, chosen, side="right") - 1

@@ -1,0 +1,75 @@
+"""`thermoxels split` on a drawn scene: blocks are scenes whose lattices coincide."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.cli import main
+from thermoxels_ns.commands.split import LIST, boxes_of_blocks
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.synthetic.drawn_scenes import make_scene
+from thermoxels_ns.synthetic.scene_folder import write_scene
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+@pytest.mark.parametrize("sides", [(60.0, 9.0, 8.0), (3.0, 2.9, 2.8), (12.0, 1.0, 11.9)])
+@pytest.mark.parametrize("resolution", [64, 128, 200])
+def test_voxels_of_neighbours_coincide_and_blocks_cover_the_box(count, sides, resolution) -> None:
+    box = np.array([[-7.0, 3.0, 0.4], [-7.0 + sides[0], 3.0 + sides[1], 0.4 + sides[2]]])
+    boxes = boxes_of_blocks(box, count)
+    lattices = [Lattice.covering(*one, resolution) for one in boxes.astype(np.float32)]
+    first = lattices[0]
+    places = np.array([first.world_to_index(one.lo) for one in lattices])
+    assert np.abs(places - places.round()).max() < 0.01, "voxels"
+    assert {one.shape for one in lattices} == {first.shape}
+    assert (boxes[1:, 0, 0] < boxes[:-1, 1, 0]).all(), "overlap"
+    assert (boxes[0, 0] <= box[0] + 1e-3).all() and (boxes[-1, 1] >= box[1] - 1e-3).all()
+
+
+@pytest.fixture(scope="module")
+def blocks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("split")
+    write_scene(make_scene("house-corner"), folder / "scene", 12, 3, 96, 72, progress=False, own_thermal_camera=True)
+    assert main(["split", str(folder / "scene"), "--blocks", "2", "--output-dir", str(folder / "blocks")]) == 0
+    return folder
+
+
+def test_blocks_are_scenes_of_the_photographs_that_show_them(blocks) -> None:
+    whole = {frame.image.resolve(): frame for frame in read_scene_file(blocks / "scene").frames}
+    with (blocks / "blocks" / LIST).open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["name"] for line in lines] == ["block-1", "block-2"]
+    used = set()
+    for line in lines:
+        file = read_scene_file(blocks / "blocks" / line["scene"])
+        assert file.bounds_c == pytest.approx((-20.0, 15.0)) and file.meta["metres_per_unit"] == 1.0
+        for frame in file.frames:
+            same = whole[frame.image]
+            used.add(frame.image)
+            np.testing.assert_allclose(frame.pose, same.pose)
+            np.testing.assert_allclose(frame.thermal_pose, same.thermal_pose)
+            assert frame.thermal == same.thermal.resolve()
+            assert (frame.intrinsics, frame.thermal_intrinsics) == (same.intrinsics, same.thermal_intrinsics)
+    assert used == set(whole), "the house is small: some photograph shows each part"
+
+
+def test_trainings_of_blocks_get_voxels_of_one_size(blocks) -> None:
+    found = []
+    for name in ("block-1", "block-2"):
+        parser = ThermalDataParserConfig(data=blocks / "blocks" / name).setup()
+        outputs = parser.get_dataparser_outputs("train")
+        found.append((outputs.metadata["pixel_size"], outputs.dataparser_scale))
+        given = json.loads((blocks / "blocks" / name / "transforms.json").read_text())
+        assert outputs.metadata["pixel_size"] / outputs.dataparser_scale == pytest.approx(given["pixel_size"])
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+@pytest.mark.parametrize(("count", "said"), [("1", "2 to 1000"), ("40", "photographs of each block")])
+def test_a_wrong_number_of_blocks_is_refused(blocks, capsys, tmp_path, count, said) -> None:
+    words = ["split", str(blocks / "scene"), "--blocks", count, "--output-dir", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
