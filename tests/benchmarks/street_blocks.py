@@ -114,7 +114,8 @@ class StreetBlocks:
         path.write_text(json.dumps({"materials": {"*": stone}, "outside_air": air, "time": time}), encoding="utf-8")
         command = ["thermoxels", "heat", str(mesh), "--scene", str(path), "--output-dir", str(self.output / "heat")]
         run_quietly(command, self.output / "heat.log")
-        print(f"Trainings {[round(one) for one in seconds]} s, export {export.seconds:.0f} s\n")
+        cost = f"{export.seconds:.0f} s, {export.peak_memory_gb:.1f} GB"
+        print(f"Trainings {[round(one) for one in seconds]} s, export {cost}\n")
         written = [blocks / f"block-{number + 1}" / "transforms.json" for number in range(self.blocks)]
         boxes = [json.loads(one.read_text(encoding="utf-8"))["scene_box"] for one in written]
         seams = [0.5 * (before[1][0] + after[0][0]) for before, after in pairwise(boxes)]

@@ -68,6 +68,14 @@ def test_trainings_of_blocks_get_voxels_of_one_size(blocks) -> None:
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
+def test_a_scene_that_is_in_the_way_stays(blocks, capsys, tmp_path) -> None:
+    (tmp_path / "block-2").mkdir()
+    (tmp_path / "block-2" / "transforms.json").write_text("mine")
+    assert main(["split", str(blocks / "scene"), "--blocks", "2", "--output-dir", str(tmp_path)]) == 2
+    assert "block-2/transforms.json" in capsys.readouterr().err
+    assert (tmp_path / "block-2" / "transforms.json").read_text() == "mine"
+
+
 @pytest.mark.parametrize(("count", "said"), [("1", "2 to 1000"), ("40", "photographs of each block")])
 def test_a_wrong_number_of_blocks_is_refused(blocks, capsys, tmp_path, count, said) -> None:
     words = ["split", str(blocks / "scene"), "--blocks", count, "--output-dir", str(tmp_path / "out")]

@@ -20,7 +20,7 @@ from thermoxels_ns.core.json_values import write_json
 if TYPE_CHECKING:
     from thermoxels_ns.data.scene_file import Frame, SceneFile
 
-LIST = "blocks.csv"
+LIST, _JSON = "blocks.csv", "transforms.json"
 _PARTS = 8
 """Parts of a block's longest side; neighbours overlap by one. Last resolutions are multiples of this number, so that
 the voxels of neighbours coincide."""
@@ -65,13 +65,13 @@ class Split:
             expected, got = "at least 3 photographs of each block", f"{shown.sum(axis=1).min()} of one"
             raise SceneError("blocks", expected=expected, got=got, remedy="Pass fewer --blocks.")
         names = [f"block-{number + 1}" for number in range(self.blocks)]
-        folder = result_folder(self.output_dir, (LIST,), LIST)
+        folder = result_folder(self.output_dir, (LIST, *(f"{name}/{_JSON}" for name in names)), LIST)
+        with replace_when_done(folder / LIST) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
+            csv.writer(out).writerows([("name", "scene"), *((name, name) for name in names)])
         for name, box, chosen in zip(names, boxes, shown):
             write_block(folder / name, file, box, chosen, found.pixel_size(file.frames))
             low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in box)
             print(f"{name}: {chosen.sum()} photographs, from ({low}) to ({high})")
-        with replace_when_done(folder / LIST) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
-            csv.writer(out).writerows([("name", "scene"), *((name, name) for name in names)])
         print(f"Written to {folder}. Train them, for example with: thermoxels batch {folder / LIST}")
 
 
@@ -132,4 +132,4 @@ def write_block(folder: Path, file: SceneFile, box: FloatArray, chosen: BoolArra
         low, high = file.bounds_c
         bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
         write_json(folder / "temperature_bounds.json", bounds)
-    write_json(folder / "transforms.json", content | {"scene_box": box, "pixel_size": pixel_size, "frames": frames})
+    write_json(folder / _JSON, content | {"scene_box": box, "pixel_size": pixel_size, "frames": frames})
