@@ -113,7 +113,7 @@ class StreetBlocks:
         path = self.output / "scene.yaml"
         path.write_text(json.dumps({"materials": {"*": stone}, "outside_air": air, "time": time}), encoding="utf-8")
         command = ["thermoxels", "heat", str(mesh), "--scene", str(path), "--output-dir", str(self.output / "heat")]
-        run_quietly(command, self.output / "heat.log")
+        run_quietly([*command, "--memory-gb", "12"], self.output / "heat.log")
         cost = f"{export.seconds:.0f} s, {export.peak_memory_gb:.1f} GB"
         print(f"Trainings {[round(one) for one in seconds]} s, export {cost}\n")
         written = [blocks / f"block-{number + 1}" / "transforms.json" for number in range(self.blocks)]

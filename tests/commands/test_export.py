@@ -2,7 +2,7 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 import pyvista
 import tyro
 from PIL import Image
+from scipy.spatial import KDTree
 
 from tests.support.looking_cameras import looking_at
 from tests.support.unreadable import contents, files_end_after
@@ -19,6 +20,7 @@ from thermoxels_ns.commands.export import (
     TrainedScene,
     check_options,
     export_scene,
+    joined_scene,
     viewpoint_of_cameras,
 )
 from thermoxels_ns.core.errors import CheckpointError, MeshError, OutputError, SceneError, ThermoxelsError
@@ -416,3 +418,43 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path, monkeyp
     assert export_scene(trained(ball), ExportOptions(), tmp_path)["mesh"]["share_of_area_by_support"] is None
     assert not (tmp_path / "support.png").exists()
     assert "photographs_seen" not in pyvista.read(tmp_path / "mesh-boundary.vtp").cell_data
+
+
+def block_of(ball: GridSnapshot, low: int, high: int, photographs: Photographs | None = None) -> TrainedScene:
+    """The voxels of the ball from `low` to before `high` along x, in a world whose origin is their middle."""
+    x, y, z = ball.lattice.lo
+    middle = x + 0.05 * (low + high)
+    corners, world_to_input = slice(low, high + 1), np.eye(4)
+    world_to_input[0, 3] = middle
+    lattice = Lattice((x + 0.1 * low - middle, y, z), 0.1, (high - low + 1, 13, 13))
+    arrays = [one[corners] for one in (ball.density, ball.temperature_c, ball.observed_weight)]
+    dataset = None if photographs is None else photographs.moved(np.array([-middle, 0.0, 0.0]))
+    return trained(GridSnapshot(lattice, *arrays), world_to_input=world_to_input, dataset=dataset)
+
+
+def test_two_blocks_give_the_mesh_of_the_whole(ball, tmp_path, monkeypatch) -> None:
+    """Each counts its own photographs: both blocks have the same, so that the counts are those of the whole."""
+    views = looking_at((0, 0, 0), [(2.0, y, 0.2) for y in (-0.6, 0.0, 0.6)], focal=60.0, size=40)
+    grey, thermal = np.full((3 * 1600, 3), 0.5, np.float32), np.full(3 * 1600, np.nan, np.float32)
+    centres = views.camera_to_world[:, :, 3]
+    photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey, thermal)
+    monkeypatch.setattr("thermoxels_ns.multiview.photographs.read_photographs", lambda dataset: dataset)
+    blocks = joined_scene([block_of(ball, 0, 8, photographs), block_of(ball, 5, 12, photographs)])
+    whole = trained(ball, dataset=photographs)
+    found = []
+    for name, run in (("whole", whole), ("blocks", blocks)):
+        export_scene(run, ExportOptions(pictures=False), tmp_path / name)
+        body, boundary = (pyvista.read(tmp_path / name / part) for part in ("mesh.vtu", "mesh-boundary.vtp"))
+        seen = boundary.cell_data["photographs_seen"]
+        found.append((body.volume, boundary.area, boundary.cell_centers().points, seen))
+    (volume, area, places, seen), (*sizes, others, again) = found
+    assert sizes == pytest.approx([volume, area], rel=1e-5)
+    off, same = KDTree(others).query(places)
+    assert off.max() < 0.01 and seen.any(), "a tenth of a voxel: densities of centres are rounded"
+    assert np.mean(again[same] == seen) > 0.97, "but for what is seen under a grazing angle"
+
+
+def test_blocks_of_another_scale_are_refused(ball) -> None:
+    first, second = block_of(ball, 0, 8), block_of(ball, 5, 12)
+    with pytest.raises(MeshError, match=r"beside.*2 times as long"):
+        joined_scene([first, replace(second, world_to_input=second.world_to_input @ np.diag([2.0, 2.0, 2.0, 1.0]))])

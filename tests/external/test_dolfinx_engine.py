@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import building_corner, graded
+from tests.support.heat_bodies import STEEL, building_corner, graded, make_body
 from thermoxels_ns.commands.heat import Heat, run_heat
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, Varying
@@ -75,6 +75,26 @@ def test_all_effects_in_a_steady_state_and_through_time(engine, heat_problem) ->
 
 
 @pytest.mark.parametrize("engine", [2], indirect=True)
+def test_a_body_that_DOLFINx_would_tear_is_refused(engine, random_body) -> None:
+    """Its voxels touch by edges alone in two places."""
+    with pytest.raises(HeatError, match="tears between processes"):
+        solve_heat(HeatProblem(random_body, STEEL), FOUR_HOURS, engine=engine)
+
+
+@pytest.mark.parametrize(("fixed", "time"), [(True, None), (True, 40), (False, 40)])
+def test_bodies_that_become_level(engine, fixed, time) -> None:
+    """Nothing flows in the end, so that nothing but round-off is left to balance."""
+    effects, rng = (FixedTemperature(("*",), 20.0),) * fixed, np.random.default_rng(7)
+    body = make_body(np.ones((6, 5, 4), bool), 0.05, lambda points: rng.uniform(-15.0, 45.0, len(points)))
+    problem = HeatProblem(body, STEEL, effects=effects)
+    if time is None:
+        found = solve_steady(problem, engine=engine).temperature_c
+    else:
+        found = solve_heat(problem, TimeSteps(time, 86400.0), engine=engine).temperature_c[-1]
+    assert np.ptp(found) < 1e-6 and (not fixed or found.mean() == pytest.approx(20.0))
+
+
+@pytest.mark.parametrize("engine", [2], indirect=True)
 def test_the_command_writes_the_same_answers(engine, heat_problem, tmp_path) -> None:
     write_mesh(tmp_path / "mesh.vtu", heat_problem.mesh)
     body = {"conductivity_w_mk": 1.7, "density_kg_m3": 2200, "specific_heat_j_kgk": 880}
@@ -87,13 +107,23 @@ def test_the_command_writes_the_same_answers(engine, heat_problem, tmp_path) -> 
     flows = []
     for name in ("own", "dolfinx"):
         options = Heat(
-            tmp_path / "mesh.vtu", str(scene), tmp_path / name, engine=name, ranks=engine.ranks, pictures=False
+            tmp_path / "mesh.vtu",
+            str(scene),
+            tmp_path / name,
+            engine=name,
+            ranks=2 if name == "dolfinx" else 1,
+            pictures=False,
         )
         said = list[str]()
         run_heat(options, said.append)
         flows.append(json.loads((tmp_path / name / "answers.json").read_text())["effects"][0]["heat_w"])
         assert any(line.startswith("DOLFINx: 2 processes") for line in said) == (name == "dolfinx")
     assert flows[1] == pytest.approx(flows[0], rel=1e-6)
+
+
+def test_less_than_one_process_is_refused() -> None:
+    with pytest.raises(HeatError, match="ranks"):
+        DolfinxEngine(0)
 
 
 @pytest.mark.parametrize(("time", "goals"), [(AdaptiveSteps(3600.0), Goals()), (None, Goals(flow_tolerance=0.01))])

@@ -83,13 +83,15 @@ def test_each_takes_its_half_of_the_overlap_and_nothing_is_known_beside_them() -
     assert found.evidence is not None and not found.evidence.voxel_weight[:6, 5:].any()
 
 
-@pytest.mark.parametrize("fault", ["half a voxel off", "other voxels"])
+@pytest.mark.parametrize("fault", ["half a voxel off", "other voxels", "a gap"])
 def test_blocks_that_do_not_fit_are_refused(fault) -> None:
     _, blocks, shifts = three_blocks()
-    if fault == "other voxels":
+    if fault == "a gap":
+        blocks, shifts = [blocks[0], blocks[2]], shifts[[0, 2]]
+    elif fault == "other voxels":
         lattice = blocks[1].lattice
         blocks[1] = replace(blocks[1], lattice=Lattice(lattice.lo, 1.01 * SIZE, lattice.shape))
     else:
         shifts[1, 2] += 0.5 * SIZE
-    with pytest.raises(MeshError, match="voxels"):
+    with pytest.raises(MeshError, match="alone" if fault == "a gap" else "voxels"):
         joined(blocks, shifts)

@@ -350,14 +350,19 @@ def with_support(built: BuiltMesh, run: TrainedScene, to_mesh: FloatArray) -> Bu
 def joined_scene(runs: Sequence[TrainedScene]) -> TrainedScene:
     """Return one trained scene of blocks, in the world of the first; one alone is returned as it is.
 
-    Raises `MeshError` unless the blocks' voxels coincide, see `joined_fields.joined`.
+    Raises `MeshError` unless the blocks overlap and their voxels coincide, see `joined_fields.joined`.
     """
     if len(runs) == 1:
         return runs[0]
     from thermoxels_ns.mesh.joined_fields import joined
 
     into = np.linalg.inv(runs[0].world_to_input)
-    shifts = np.stack([(into @ run.world_to_input)[:3, 3] for run in runs])
+    moves = [into @ run.world_to_input for run in runs]
+    sizes = [float(np.cbrt(np.linalg.det(move[:3, :3]))) for move in moves]
+    if not np.allclose(sizes, 1.0, rtol=0.0, atol=2e-5):
+        expected, got = "blocks with boxes of one size", f"boxes up to {max(sizes):.4g} times as long as the first"
+        raise MeshError("beside", expected=expected, got=got, remedy="Pass the blocks of one thermoxels split.")
+    shifts = np.stack([move[:3, 3] for move in moves])
     snapshot, owner = joined([run.snapshot for run in runs], shifts)
     blocks = tuple(Block(run, shift, owner == number) for number, (run, shift) in enumerate(zip(runs, shifts)))
     corrections = {f"block {number + 1}": run.corrections for number, run in enumerate(runs)}

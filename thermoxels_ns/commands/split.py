@@ -7,17 +7,19 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
-from thermoxels_ns.core.checks import replace_when_done, result_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.layouts import LayoutName
 
 if TYPE_CHECKING:
+    from thermoxels_ns.core.camera import Camera
     from thermoxels_ns.data.scene_file import Frame, SceneFile
 
 LIST, _JSON = "blocks.csv", "transforms.json"
@@ -25,9 +27,12 @@ _PARTS = 8
 """Parts of a block's longest side; neighbours overlap by one. Last resolutions are multiples of this number, so that
 the voxels of neighbours coincide."""
 _SLACK = 1e-5  # Share of a part by which a block is shorter than a whole number of them, at either end: round-off
-_IN_BLOCK = 0.1  # A photograph belongs to a block if at least this share of the points that it shows lies in the block
-_PROBES = 4096  # Random points of the box that stand for its content where nothing is known of it
+_IN_BLOCK = 0.1
+"""A photograph belongs to a block if at least this share of what it shows of the scene lies in the block, or more than
+in any other block."""
+_PROBES = 10_000  # Points of the scene, about, by which this is judged; random ones in the box if none are known
 _KEPT = ("metres_per_unit", "up", "thermal_unit")  # Entries of the scene's json that each block gets
+_BOUNDS = "temperature_bounds.json"
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
@@ -45,27 +50,47 @@ class Split:
     """Number of blocks along the longest side of the scene's box, 2 to 1000."""
     output_dir: Path = Path("blocks")
     """Folder for the blocks and the list; made if it does not exist."""
+    layout: LayoutName | None = None
+    """Layout of the scene folder, as for ns-train; left out: the first that fits."""
+    missing_thermal: Literal["error", "skip"] = "error"
+    """What to do with a photograph that has no thermal image: stop, or leave it out."""
 
     def main(self) -> None:
         """Write the blocks; raises `ThermoxelsError` if the scene cannot be read, or too few photographs show one."""
+        from thermoxels_ns.data.dataparser import refine_poses, split_frames
         from thermoxels_ns.data.scene_box import find_scene_box
         from thermoxels_ns.data.scene_file import read_scene_file
         from thermoxels_ns.data.tracks import find_tracks
 
         if not 2 <= self.blocks <= 1000:
             raise SceneError("blocks", expected="2 to 1000", got=self.blocks, remedy="Pass --blocks 3, for example.")
-        file = read_scene_file(self.scene)
-        found = find_scene_box(file, None, range(len(file.frames)), find_tracks(file))
+        file, tracks = read_scene_file(self.scene, self.missing_thermal, self.layout), None
+        training = split_frames([frame.name for frame in file.frames], file.meta, "auto", 8, file.left_out).train
+        try:
+            tracks = find_tracks(file)
+        except SceneError as problem:
+            print(f"Tracks: the COLMAP model is not used: {problem}")
+        if tracks is None:  # once for all blocks: each for itself would move its poses
+            file = refine_poses(file, training, print)[0]
+        found = find_scene_box(file, None, training, tracks)
         boxes = boxes_of_blocks(found.box, self.blocks)
-        points = found.points
-        if points is None:
-            points = np.random.default_rng(0).uniform(*found.box, size=(_PROBES, 3))
-        shown = shares_shown(file.frames, points, boxes) >= _IN_BLOCK
+        points = np.random.default_rng(0).uniform(*found.box, size=(_PROBES, 3))
+        if found.points is not None:
+            inside = found.points[((found.points >= found.box[0]) & (found.points <= found.box[1])).all(axis=1)]
+            points = inside[:: max(len(inside) // _PROBES, 1)]
+        shares = shares_shown(file.frames, points, boxes)
+        shown = (shares >= _IN_BLOCK) | ((shares == shares.max(axis=0)) & (shares > 0.0))
+        if not shown.any(axis=0).all():
+            print(
+                f"{np.count_nonzero(~shown.any(axis=0))} photographs show nothing of the scene's box, and are left out"
+            )
         if shown.sum(axis=1).min() < 3:
             expected, got = "at least 3 photographs of each block", f"{shown.sum(axis=1).min()} of one"
             raise SceneError("blocks", expected=expected, got=got, remedy="Pass fewer --blocks.")
         names = [f"block-{number + 1}" for number in range(self.blocks)]
-        folder = result_folder(self.output_dir, (LIST, *(f"{name}/{_JSON}" for name in names)), LIST)
+        folder = result_folder(
+            self.output_dir, (LIST, *(f"{n}/{part}" for n in names for part in (_JSON, _BOUNDS))), LIST
+        )
         with replace_when_done(folder / LIST) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
             csv.writer(out).writerows([("name", "scene"), *((name, name) for name in names)])
         for name, box, chosen in zip(names, boxes, shown):
@@ -114,22 +139,31 @@ def write_block(folder: Path, file: SceneFile, box: FloatArray, chosen: BoolArra
     frames, named = list[dict[str, Any]](), dict[str, str]()
     for frame, is_chosen in zip(file.frames, chosen):
         if is_chosen:
-            entry = {"file_path": str(frame.image.resolve()), "transform_matrix": frame.pose.tolist()}
+            entry = {"file_path": str(frame.image.absolute()), "transform_matrix": frame.pose.tolist()}
             named[frame.name] = entry["file_path"]
             for key, path in (("thermal_file_path", frame.thermal), ("mask_path", frame.mask)):
-                entry |= {} if path is None else {key: str(path.resolve())}
+                entry |= {} if path is None else {key: str(path.absolute())}
             if frame.thermal_pose is not None:
                 entry["thermal_transform_matrix"] = frame.thermal_pose.tolist()
             if frame.thermal_intrinsics is not None:
-                entry["thermal_camera"] = frame.thermal_intrinsics.entries()
-            frames.append(entry | frame.intrinsics.entries())
+                entry["thermal_camera"] = _lens(frame.thermal_intrinsics)
+            frames.append(entry | _lens(frame.intrinsics))
     content: dict[str, Any] = {key: file.meta[key] for key in _KEPT if key in file.meta}
     for key in _SPLITS:
-        if key in file.meta:
-            content[key] = [named[name] for name in file.meta[key] if name in named]
+        listed = [named[name] for name in map(_plain, file.meta.get(key, ())) if name in named]
+        content |= {key: listed} if listed else {}
     folder.mkdir(parents=True, exist_ok=True)
+    remove_file(folder / _BOUNDS)
     if file.bounds_c is not None:
         low, high = file.bounds_c
-        bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
-        write_json(folder / "temperature_bounds.json", bounds)
-    write_json(folder / _JSON, content | {"scene_box": box, "pixel_size": pixel_size, "frames": frames})
+        write_json(folder / _BOUNDS, {"absolute_min_temperature": low, "absolute_max_temperature": high})
+    content |= {"scene_box": box, "pixel_size": pixel_size, "poses_refined": True}
+    write_json(folder / _JSON, content | {"frames": frames})
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    return camera.entries() | {"k3": camera.k3, "k4": camera.k4}
+
+
+def _plain(name: object) -> str:
+    return Path(str(name)).as_posix()

@@ -21,6 +21,7 @@ from PIL import Image
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
@@ -166,7 +167,7 @@ class ThermalDataParser(DataParser):
                 "image_scale": factor,
                 "thermal_filenames": [frame.thermal for frame in frames] if scene.file.has_thermal else None,
                 "thermal_cameras": None if shared else thermal_cameras,
-                "pixel_size": scene.metadata["pixel_size"] / factor,
+                "pixel_size": scene.metadata["pixel_size"] / (1.0 if "pixel_size" in scene.file.meta else factor),
                 "feature_rays": scene.feature_rays if training else None,
                 "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,
                 "adjusted_poses": {f.image.name: f.pose for f in frames} if scene.adjusted and training else None,
@@ -209,7 +210,7 @@ class ThermalDataParser(DataParser):
             tracks = None
             CONSOLE.print(f"Tracks: the COLMAP model is not used (--tracks off leaves it alone): {problem}")
         given, fitted = file, {}
-        if rays is None and config.refine_poses == "auto":
+        if rays is None and config.refine_poses == "auto" and not file.meta.get("poses_refined"):
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         found = find_scene_box(file, config.scene_box, split.train, tracks)
         box = found.box
@@ -218,7 +219,10 @@ class ThermalDataParser(DataParser):
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
-        pixel_size = float(file.meta.get("pixel_size") or found.pixel_size(file.frames))  # given in blocks of a scene
+        given_size = file.meta.get("pixel_size")  # in the blocks of a scene, whose voxels are to have one size
+        pixel_size = found.pixel_size(file.frames)
+        if given_size is not None:
+            pixel_size = check_positive("pixel_size", given_size, "Correct the json, or remove the entry.", SceneError)
         if math.isinf(pixel_size):
             expected = f"photographs that look at the scene box, from {found.source}"
             remedy = (

@@ -194,6 +194,7 @@ class ImplicitEquation:
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
         """Assemble M / step + K + R at `time_s` for steps of length `step_s`, [s]; inf stands for the steady state."""
         self._system, self._step_s, self._relative_tolerance = system, step_s, relative_tolerance
+        self._time_s = time_s
         convection = system.convection_matrix(time_s)
         self._row_sums_w_k: Vector = np.zeros(system.num_nodes)
         """Row sums of the matrix, shape (n,), [W / K]; summed over M / step + R alone, as the row sums of K are 0."""
@@ -203,9 +204,12 @@ class ImplicitEquation:
         """Diagonal of K plus row sums of R, shape (n,), [W / K]; round-off is estimated from it."""
         if np.isfinite(step_s):
             self._row_sums_w_k += system.nodal_mass_j_k / step_s
-        self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
-        """The rows and columns of M / step + K + R that belong to free nodes, [W / K]."""
         self._solvers: dict[float, LinearSolver] = {}
+
+    @cached_property
+    def _matrix(self) -> sparse.csr_matrix:
+        """The rows and columns of M / step + K + R that belong to free nodes, [W / K]."""
+        return self._free_block(self._system.matrix(self._time_s, self._step_s))
 
     def solve(
         self, start_k: Vector, time_s: float, given_w: Vector | None = None, found_k: Vector | None = None

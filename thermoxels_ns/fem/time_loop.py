@@ -194,6 +194,9 @@ def solve_heat(
         HeatError: An effect does not fit the mesh, a material's heat capacity is below `LEAST_CAPACITY_J_M3K`, a step's
             solver does not converge, or the temperature falls below absolute zero.
     """
+    if engine is not None and (isinstance(time, AdaptiveSteps) or scheme is not BACKWARD_EULER):
+        remedy = "Leave out --engine, or give the scene time: {steps, step_seconds}."
+        raise HeatError("engine", expected="equal steps of backward Euler", got="other steps", remedy=remedy)
     least = float(np.min(problem.heat_capacity_j_m3k))
     if least < LEAST_CAPACITY_J_M3K:
         expected = f"at least {LEAST_CAPACITY_J_M3K:g} J/(m3 K) to follow a body through time (air has 1200)"

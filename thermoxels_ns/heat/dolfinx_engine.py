@@ -8,13 +8,16 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.system import HeatSystem
@@ -23,7 +26,7 @@ from thermoxels_ns.mesh.files.formats import write_xdmf
 PYTHON = "THERMOXELS_FENICSX_PYTHON"  # Environment variable that names the Python that has DOLFINx
 _PROGRAM = Path(__file__).with_name("dolfinx_program.py")
 _NOT_FOR_OTHERS = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")  # Variables that lead to this environment's packages
-_LINES_SHOWN = 12  # Last lines of a failed program that an error shows
+_LINES_SHOWN = 12  # Last lines of a failed command that an error shows
 
 
 @dataclass(frozen=True)
@@ -33,65 +36,73 @@ class DolfinxEngine:
     ranks: int = 1  # Number of MPI processes
     say: Callable[[str], None] = print  # Called with lines of progress
 
+    def __post_init__(self) -> None:
+        if self.ranks < 1:
+            raise HeatError("ranks", expected="at least 1", got=self.ranks, remedy="Pass --ranks 2, for example.")
+
     def __call__(self, system: HeatSystem, times_s: FloatArray) -> FloatArray:
         """Return the temperatures minus `system.reference_c` at the ends of the steps, shape (s, n), [K].
 
         The steps of backward Euler lead from one of `times_s` (s + 1,), [s], to the next, from the initial temperature;
         the one time 0 asks for the steady state instead. Raises `HeatError` if DOLFINx is not there or fails.
         """
-        command = self._command()
-        with tempfile.TemporaryDirectory(prefix="thermoxels-dolfinx-") as name:
-            folder = Path(name)
-            write_problem(folder, system, times_s)
-            own = {key: value for key, value in os.environ.items() if key not in _NOT_FOR_OTHERS}
-            # Containers run as root, which Open MPI refuses without being told twice.
-            own |= {"OMP_NUM_THREADS": "1", "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-            lines = list[str]()
-            with subprocess.Popen(
-                # mpi4py ends all processes if one fails.
-                [*command, "-m", "mpi4py", str(_PROGRAM), str(folder)],
-                env=own,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            ) as process:
-                assert process.stdout is not None
-                for line in process.stdout:
-                    lines.append(line.rstrip())
-                    if line.startswith("DOLFINx:"):
-                        self.say(line.rstrip())
-            if process.returncode:
-                got = f"status {process.returncode}: {' / '.join(lines[-_LINES_SHOWN:])}"
-                remedy = "Solve with --engine own, or on fewer --ranks if memory ran out."
-                raise HeatError("engine dolfinx", expected="an answer", got=got, remedy=remedy)
-            return np.load(folder / "states.npy")
-
-    def _command(self) -> list[str]:
         python = os.environ.get(PYTHON, "/usr/bin/python3")
         remedy = f"Install python3-dolfinx (Debian, Ubuntu), let {PYTHON} name a Python that has it, or leave --engine."
-        probe = [python, "-c", "import dolfinx, petsc4py"]
-        own = {key: value for key, value in os.environ.items() if key not in _NOT_FOR_OTHERS}
-        if shutil.which(python) is None or subprocess.run(probe, env=own, capture_output=True, check=False).returncode:
-            raise HeatError("engine", expected=f"DOLFINx for {python}", got="none", remedy=remedy)
-        if self.ranks == 1:
-            return [python]
-        if shutil.which("mpirun") is None:
+        if shutil.which(python) is None:
+            raise HeatError("engine", expected="a Python that has DOLFINx", got=f"no {python}", remedy=remedy)
+        status, said = self._run([python, "-c", "import dolfinx, petsc4py, mpi4py"])
+        if status:
+            raise HeatError("engine", expected=f"DOLFINx for {python}", got=said or f"status {status}", remedy=remedy)
+        beside = Path(python).with_name("mpirun")
+        mpirun = str(beside) if beside.is_file() else shutil.which("mpirun")
+        if self.ranks > 1 and mpirun is None:
             raise HeatError("ranks", expected="mpirun on the path", got="none", remedy="Leave --ranks, or install MPI.")
-        return ["mpirun", "-n", str(self.ranks), python]
+        command = [python] if mpirun is None or self.ranks == 1 else [mpirun, "-n", str(self.ranks), python]
+        with (
+            plain_os_errors("files for DOLFINx", remedy="Free space, or let TMPDIR name a folder with more."),
+            tempfile.TemporaryDirectory(prefix="thermoxels-dolfinx-") as folder,
+        ):
+            write_problem(Path(folder), system, times_s)
+            # mpi4py ends all processes if one fails.
+            status, said = self._run([*command, "-m", "mpi4py", str(_PROGRAM), folder, str(self.ranks)])
+            if status:
+                remedy = "Leave --engine, or pass fewer --ranks if there are fewer processors or memory ran out."
+                raise HeatError("engine dolfinx", expected="an answer", got=said or f"status {status}", remedy=remedy)
+            return np.load(Path(folder) / "states.npy")
+
+    def _run(self, command: list[str]) -> tuple[int, str]:
+        """Run a command outside of this Python's environment; return its status and its last lines on faults."""
+        own = {key: value for key, value in os.environ.items() if key not in _NOT_FOR_OTHERS}
+        # Containers run as root, which Open MPI refuses without being told twice.
+        own |= {"OMP_NUM_THREADS": "1", "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+        lines = deque[str](maxlen=_LINES_SHOWN)
+        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        with subprocess.Popen(command, env=own, text=True, **pipes) as process:
+            assert process.stdout is not None
+            for line in map(str.strip, process.stdout):
+                if line.startswith("DOLFINx:"):
+                    self.say(line)
+                elif line and not line.startswith(("---", "MPI_ABORT", "with errorcode", "NOTE: invoking")):
+                    lines.append(line)
+        return process.returncode, " / ".join(lines)
 
 
 def write_problem(folder: Path, system: HeatSystem, times_s: FloatArray) -> None:
     """Write a problem of linear tetrahedra for the program: mesh, materials, and vectors with an entry per node.
 
     With lumped integrals, effects act node by node: the heat into a node is load - convection T - emitted |Ta|^3 Ta
-    with the temperature T minus the reference and the absolute one Ta. A vector that does not change has one file, that
-    of step 0.
+    with the temperature T minus the reference and the absolute one Ta. A vector has a file of each step at which it is
+    another than before.
     """
     problem, steps_s = system.problem, np.diff(times_s)
     level, absolute_k = np.zeros(system.num_nodes), system.reference_c + ZERO_CELSIUS_K
 
+    last: dict[str, FloatArray] = {}
+
     def write(name: str, step: int, vector: FloatArray) -> None:
-        np.save(folder / f"{name}-{step}.npy", vector)
+        if name not in last or not np.array_equal(vector, last[name]):
+            np.save(folder / f"{name}-{step}.npy", vector)
+            last[name] = vector
 
     write("start", 0, system.start_k)
     for step, step_s in enumerate(steps_s):

@@ -70,12 +70,9 @@ def solve_problem(
     Raises `HeatError` if more memory than allowed is needed, the solver fails, the tolerance cannot be met, or the
     engine cannot follow what is asked.
     """
-    if engine is not None and (goals.estimated or isinstance(time, AdaptiveSteps)):
-        got = "a tolerance" if goals.estimated else "steps whose length follows from a tolerance"
-        remedy = (
-            "Leave out --engine, or --tolerance and --flow-tolerance, and give the scene time: {steps, step_seconds}."
-        )
-        raise HeatError("engine", expected="a steady state or equal steps, without a tolerance", got=got, remedy=remedy)
+    if engine is not None and goals.estimated:
+        remedy = "Leave out --engine, or --tolerance and --flow-tolerance."
+        raise HeatError("engine", expected="no tolerance beside it", got="a tolerance", remedy=remedy)
     if not goals.estimated:
         needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
         say(f"Memory: about {describe_bytes(needed)} at most.")

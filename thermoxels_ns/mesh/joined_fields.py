@@ -20,7 +20,8 @@ def joined(blocks: Sequence[GridSnapshot], shifts: FloatArray) -> tuple[GridSnap
 
     `shifts` (b, 3) move each block into the world of the result, [world units]. Where blocks overlap, a voxel or corner
     is taken from the block in whose lattice it lies deepest, so that a seam runs through the middle of the overlap. The
-    number is -1, and the density 0, where no block is. Raises `MeshError` unless the blocks' voxels coincide.
+    number is -1, and the density 0, where no block is. Raises `MeshError` unless each block overlaps another and all
+    voxels coincide.
     """
     first = blocks[0].lattice
     index = [first.world_to_index(np.add(one.lattice.lo, shift)) for one, shift in zip(blocks, shifts)]
@@ -30,6 +31,12 @@ def joined(blocks: Sequence[GridSnapshot], shifts: FloatArray) -> tuple[GridSnap
         expected, got = "blocks whose voxels coincide", f"voxels of {min(sizes):.4g} to {max(sizes):.4g}, apart"
         remedy = "Train the blocks of one thermoxels split with the same options."
         raise MeshError("blocks", expected=expected, got=got, remedy=remedy)
+    ends = starts + [one.lattice.cell_shape for one in blocks]
+    for number, (start, end) in enumerate(zip(starts, ends)):
+        overlaps = (np.maximum(start, starts) < np.minimum(end, ends)).all(axis=1)
+        if overlaps.sum() < 2:
+            remedy = "Pass all blocks of one thermoxels split."
+            raise MeshError("blocks", expected="blocks that overlap", got=f"block {number + 1} alone", remedy=remedy)
     starts -= starts.min(axis=0)
     nx, ny, nz = np.max([start + one.lattice.shape for start, one in zip(starts, blocks)], axis=0).tolist()
     x, y, z = first.index_to_world(np.rint(np.min(index, axis=0))).tolist()
