@@ -1,4 +1,5 @@
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -106,16 +107,17 @@ def test_quiet_background_is_not_dead():
     assert not find_dead_pixels(few).any()
 
 
-@pytest.mark.parametrize("big_endian", [False, True])
-def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
+def test_a_tiff_of_floating_point_numbers_is_celsius(tmp_path, kind, packed):
     values, path = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]]), tmp_path / "a.tiff"
-    assert cv2.imwrite(str(path), values)
-    if big_endian:  # one strip without compression
-        tags = {256: 3, 257: 2, 258: 64, 259: 1, 262: 1, 273: 0, 277: 1, 278: 2, 279: values.nbytes, 339: 3}
-        tags[273] = 8 + 2 + 12 * len(tags) + 4
-        entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
-        head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
-        path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
+    strip, order, bits = values.astype(kind).tobytes(), kind[0], 8 * int(kind[2])
+    strip = zlib.compress(strip) if packed else strip
+    tags = {256: 3, 257: 2, 258: bits, 259: 8 if packed else 1, 262: 1, 273: 0, 277: 1, 278: 2, 279: len(strip), 339: 3}
+    tags[273] = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
+    path.write_bytes(head + entries + bytes(4) + strip)
     for got in (read_thermal_file(path, BOUNDS), read_thermogram(path).temperature_c):
         np.testing.assert_array_equal(got, values.astype(np.float32))
     assert identify(path, tmp_path).role == "thermal"

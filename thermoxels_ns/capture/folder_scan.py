@@ -18,7 +18,7 @@ from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
 from thermoxels_ns.radiometry.decoders import check_not_empty, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, size_of_double_tiff
+from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
 """What a camera file holds. "both": photograph and temperatures; "thermal picture": colours alone, named thermal."""
@@ -133,8 +133,6 @@ def identify(path: Path, folder: Path) -> CameraFile:
                 return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
             if is_dji_rjpeg(path):
                 return CameraFile(path, "thermal", read_photograph_facts(path).taken_at)
-        elif size_of_double_tiff(path) is not None:
-            return CameraFile(path, "thermal", None)
         else:
             with Image.open(path) as image:
                 # A picture with one channel of more than 8 bits is no photograph.

@@ -34,8 +34,9 @@ _STARTS: dict[bytes, ThermalFormat] = {
 }
 _NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
 _TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
-_WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
-_FLOATING = 3  # value of TIFF's sample format for floating-point numbers
+# Pillow can unpack grey TIFFs of 64-bit floating-point numbers, but its table of TIFFs lacks them.
+for _order, _packed in ((b"II", "F;64F"), (b"MM", "F;64BF")):
+    TiffImagePlugin.OPEN_INFO |= {(_order, lightest, (3,), 1, (64,), ()): ("F", _packed) for lightest in (0, 1)}
 VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range are masked, [degrees C]
 MIN_FRAMES = 5  # with fewer frames, no pixel counts as stuck
 _WINDOW = 2  # half width of a neighbourhood of 5 x 5 pixels, in which a dead column or row is a minority
@@ -194,23 +195,22 @@ def _number(cell: str) -> float:
 def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
     """Return the numbers (height, width) of a grey picture, and a mask of its transparent pixels (None: no alpha)."""
     pixels = None
-    size = size_of_double_tiff(path)  # Pillow cannot open a TIFF of 64-bit numbers
-    if size is not None:
-        check_thermal_size(path, *size)
-    else:
-        with Image.open(path) as image:
-            check_thermal_size(path, *image.size)
-            pages = getattr(image, "n_frames", 1)
-            if pages != 1:
-                remedy = "Save the page that holds the temperatures as a file of its own."
-                raise ThermalFileError(str(path), expected="one image", got=f"{pages} pages", remedy=remedy)
-            image.load()  # raises on truncated data
-            if image.mode in ("L", "F") or image.mode.startswith("I"):
-                pixels = np.asarray(image)
-                # Some versions of Pillow return 16-bit counts as 32 bits; some files have the other byte order.
-                short = image.mode == "I" and image.format == "PNG"
-                pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
-    if pixels is None:  # a colour picture, of which Pillow would keep only 8 bits, or a 64-bit TIFF
+    with Image.open(path) as opened:
+        image: Any = opened
+        check_thermal_size(path, *image.size)
+        pages = getattr(image, "n_frames", 1)
+        if pages != 1:
+            remedy = "Save the page that holds the temperatures as a file of its own."
+            raise ThermalFileError(str(path), expected="one image", got=f"{pages} pages", remedy=remedy)
+        # Pillow swaps the bytes of a compressed TIFF of big-endian floating-point numbers once too often.
+        swapped = image.mode == "F" and image.tile[0][0] == "libtiff" and image.tile[0][3][0].endswith("BF")
+        image.load()  # raises on truncated data
+        if (image.mode in ("L", "F") or image.mode.startswith("I")) and not swapped:
+            pixels = np.asarray(image)
+            # Some versions of Pillow return 16-bit counts as 32 bits; some files have the other byte order.
+            short = image.mode == "I" and image.format == "PNG"
+            pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
+    if pixels is None:  # `swapped`, or a colour picture, of which Pillow would keep only 8 bits
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise _damaged(path, "an image that cannot be decoded")
@@ -226,19 +226,6 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
         got = "a false-colour picture: its palette cannot be turned back into temperatures"
         raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
     return np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None
-
-
-def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
-    """Return width and height of a TIFF with one channel of 64-bit floating-point numbers; None for other files."""
-    with path.open("rb") as stream:
-        head = stream.read(8)
-        if not head.startswith((b"II*\0", b"MM\0*")):
-            return None
-        tags = TiffImagePlugin.ImageFileDirectory_v2(head)
-        stream.seek(tags.next)
-        tags.load(stream)
-    kind = [tags.get(tag, (0,)) for tag in (_SAMPLE_BITS, _SAMPLE_FORMAT)]
-    return (tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)) if kind == [(64,), (_FLOATING,)] else None
 
 
 def _damaged(path: Path, problem: object) -> ThermalFileError:

@@ -24,7 +24,6 @@ from thermoxels_ns.radiometry.thermal_pixels import (
     detect_format,
     masked_image,
     read_thermal_file,
-    size_of_double_tiff,
 )
 
 COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
@@ -120,7 +119,7 @@ def _read_stored(
     unit = None if options.camera is None else COUNT_SCALES[options.camera][0]
     if options.celsius_per_count is not None and options.celsius_offset is not None:
         unit = ThermalUnit.linear(options.celsius_per_count, options.celsius_offset)
-    if picture and size_of_double_tiff(path) is None:
+    if picture:
         with Image.open(path) as image:
             check_thermal_size(path, *image.size)
             mode, (camera, _) = image.mode, read_exif_facts(image)
