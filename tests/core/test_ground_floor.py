@@ -271,9 +271,9 @@ def test_points_without_lines_are_not_doubted_and_nothing_is_made_of_nothing() -
 
 @pytest.fixture(autouse=True)
 def restored() -> Iterator[None]:
-    before = threads._state["threads"]
+    before = threads._threads
     yield
-    set_num_threads(before or None)
+    set_num_threads(before)
 
 
 @given(st.integers(1, 6), st.integers(0, 5000), st.integers(1, 300))

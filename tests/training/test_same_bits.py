@@ -24,9 +24,9 @@ def scene(tmp_path_factory) -> Path:
 @pytest.fixture
 def restored_threads() -> Iterator[None]:
     """Give kernels and torch their threads back after a test."""
-    kernels, ours = threads._state["threads"], torch.get_num_threads()
+    kernels, ours = threads._threads, torch.get_num_threads()
     yield
-    threads.set_num_threads(kernels or None)
+    threads.set_num_threads(kernels)
     torch.set_num_threads(ours)
 
 
