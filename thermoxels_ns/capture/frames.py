@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,6 @@ class CaptureFrame:
     gps: GpsFix | None = None
     gimbal_deg: tuple[float, float] | None = None  # pitch and roll of the camera, [degrees]
     thermal_focal_px: float | None = None  # focal length that the thermal file states, [thermal pixels]
-    masked: int = 0  # number of thermal pixels without a temperature
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,7 @@ def read_frames(
                 why = f"{width} x {height} pixels, most have {most[0]} x {most[1]}: another camera or mode"
                 dropped[frame.name] = f"{file} has {why}"
     kept = [frame for frame in frames if frame.name not in dropped]
-    dead, kept = _without_stuck_pixels(kept)
-    return CaptureFrames(tuple(kept), usual[0], usual[1], dead, dropped)
+    return CaptureFrames(tuple(kept), usual[0], usual[1], _mask_stuck_pixels(kept), dropped)
 
 
 _Size = tuple[int, int]  # width and height, [pixels]
@@ -135,25 +133,20 @@ def _read(
         gps=facts.gps or holder.gps,
         gimbal_deg=facts.gimbal_deg or holder.gimbal_deg,
         thermal_focal_px=thermal_focal,
-        masked=int(np.isnan(thermogram.temperature_c).sum()),
     )
     height, width = thermogram.temperature_c.shape
     return frame, ((facts.width, facts.height), (width, height))
 
 
-def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[CaptureFrame]]:
-    """Set pixels that are stuck at one value to NaN in the files of all frames; return their number and the frames."""
+def _mask_stuck_pixels(frames: list[CaptureFrame]) -> int:
+    """Set pixels that are stuck at one value to NaN in the files of all frames; return their number."""
     some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
     bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
-    if not bad.any():
-        return 0, frames
-    changed = []
-    for frame in frames:
+    for frame in frames if bad.any() else []:
         temperature_c = np.load(frame.thermal)
         temperature_c[bad] = np.nan
         np.save(frame.thermal, temperature_c)
-        changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
-    return int(bad.sum()), changed
+    return int(bad.sum())
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -92,7 +93,20 @@ def _captured(
     say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
     read = read_frames(search.pairs, source, kept, settings, say)
     say(f"temperatures: {len(read.frames)} thermal images of {read.thermal_size[0]} x {read.thermal_size[1]} pixels")
-    key = _keep_poses(read, source, kept / "poses", settings, say)
+    depends: dict[str, Any] = {
+        "options": {
+            name: getattr(settings, name) for name in ("image_size", "max_features", "lens", "seed", "threads")
+        },
+        "files": fingerprint([source / frame.name for frame in read.frames], source),
+    }
+
+    def search_poses(folder: Path) -> None:
+        photographs = {frame.name: frame.photograph for frame in read.frames}
+        focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+        middle = float(np.median(focal)) if focal else None
+        find_poses(photographs, read.photograph_size, folder, settings, middle, say)
+
+    key = run_stage(kept / "poses", depends, search_poses, settings.from_stage == "poses", say)
     found = read_poses(kept / "poses", [frame.name for frame in read.frames], read.photograph_size)
     say(f"poses: {len(found.frames)} of {len(read.frames)} frames, {len(found.points)} points")
     few = "too few matches with the largest group of photographs that fit together"
@@ -132,22 +146,3 @@ def _captured(
     result = CaptureResult(source, output, search.pairs, dropped, read, scene, start, missing)
     write_page(result)
     return result
-
-
-def _keep_poses(
-    read: CaptureFrames, source: Path, folder: Path, settings: CaptureSettings, say: Callable[[str], None]
-) -> str:
-    """Find poses and scene points and write them to `folder`, unless a valid result is there; return its key."""
-    names = ("image_size", "max_features", "lens", "seed", "threads")
-    depends = {
-        "options": {name: getattr(settings, name) for name in names},
-        "files": fingerprint([source / frame.name for frame in read.frames], source),
-    }
-
-    def work(folder: Path) -> None:
-        photographs = {frame.name: frame.photograph for frame in read.frames}
-        focal = [frame.focal_px for frame in read.frames if frame.focal_px]
-        middle = float(np.median(focal)) if focal else None
-        find_poses(photographs, read.photograph_size, folder, settings, middle, say)
-
-    return run_stage(folder, depends, work, settings.from_stage == "poses", say)

@@ -50,7 +50,7 @@ def write_capture_page(result: CaptureResult) -> None:
     for index, frame in enumerate(scene.frames):
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
         samples.append(temperature_c[:: max(1, len(temperature_c) // _SAMPLED_PIXELS)])
-        masked, pixels = masked + frame.masked, pixels + len(temperature_c)
+        masked, pixels = masked + np.count_nonzero(np.isnan(temperature_c)), pixels + len(temperature_c)
     write_page(result.page, capture_page(result, overlays, np.concatenate(samples), masked / max(pixels, 1)))
 
 
