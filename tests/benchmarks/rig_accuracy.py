@@ -14,7 +14,7 @@ import tyro
 from measuring import take_turns  # noqa: F401 (finds tests.support)
 
 from tests.support.known_rig import drawn_capture
-from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.drift import estimate_drift, sample_shared_points
 from thermoxels_ns.capture.rig.search import estimate_rig
 
 CAPTURES = (
@@ -41,7 +41,7 @@ class RigAccuracy:
             began = time.perf_counter()
             found = estimate_rig(capture.frames, capture.visible, start)
             seconds = time.perf_counter() - began
-            drift = estimate_drift(capture.frames, found.thermal_camera, found.visible_to_thermal)
+            drift = estimate_drift(sample_shared_points(capture.frames, found.thermal_camera, found.visible_to_thermal))
             offset_k = float(np.abs(drift.offsets_k - capture.offsets_k).max())
             print(
                 f"{text}: turn {capture.turn_error_deg(found):.3f} degrees, focal length "

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair, search_pairs
-from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.drift import estimate_drift, sample_shared_points
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import RigEstimate
@@ -137,7 +137,7 @@ def _captured(
         run_stage(kept / "rig", depends, search_rig, settings.from_stage is not None, say)
         rig = load_rig(kept / "rig" / "rig.npz")
     say(f"rig: {rig.explanation}")
-    drift = estimate_drift(in_rig, rig.thermal_camera, rig.visible_to_thermal)
+    drift = estimate_drift(sample_shared_points(in_rig, rig.thermal_camera, rig.visible_to_thermal))
     say(f"drift: {drift.explanation}")
     moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
     scene = Scene(frames, model, kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import known_capture
-from thermoxels_ns.capture.rig.drift import DriftSamples, drift_of_samples, estimate_drift
+from thermoxels_ns.capture.rig.drift import DriftSamples, estimate_drift, sample_shared_points
 from thermoxels_ns.capture.rig_types import radius_squared
 
 FRAMES = 12
@@ -45,7 +45,7 @@ def offsets_k() -> np.ndarray:
 def test_offsets_are_exact_without_noise_and_a_tenth_of_wrong_readings_does_not_pull_them(
     offsets_k: np.ndarray, noise_k: float, wrong_share: float, limit_k: float
 ) -> None:
-    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), noise_k, wrong_share))
+    found = estimate_drift(readings(offsets_k, (1.5, -0.4), noise_k, wrong_share))
     assert np.abs(found.offsets_k - offsets_k).max() < limit_k and abs(found.offsets_k.mean()) < 1e-12
     assert np.allclose(found.radial, (1.5, -0.4), atol=limit_k)
     assert found.used
@@ -53,7 +53,7 @@ def test_offsets_are_exact_without_noise_and_a_tenth_of_wrong_readings_does_not_
 
 
 def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -> None:
-    found = drift_of_samples(readings(offsets_k, groups=2))
+    found = estimate_drift(readings(offsets_k, groups=2))
     half = FRAMES // 2
     for part in (slice(0, half), slice(half, None)):
         assert abs(found.offsets_k[part].mean()) < 1e-6
@@ -61,11 +61,11 @@ def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -
 
 
 def test_too_few_points_or_frames_are_said() -> None:
-    few = drift_of_samples(readings(np.ones(FRAMES), points=20))
+    few = estimate_drift(readings(np.ones(FRAMES), points=20))
     assert not few.used
     assert "only 20 scene points" in few.explanation
     capture = known_capture("sphere", views=2, photograph_width=80, thermal_width=40)
-    one = estimate_drift(capture.frames[:1], capture.thermal, capture.visible_to_thermal)
+    one = estimate_drift(sample_shared_points(capture.frames[:1], capture.thermal, capture.visible_to_thermal))
     assert not one.used
     assert len(one.offsets_k) == 1
     assert "only 0 scene points" in one.explanation
@@ -76,7 +76,7 @@ def test_images_are_corrected_by_what_was_put_into_them_where_they_have_a_temper
     hole = np.zeros((capture.thermal.height, capture.thermal.width), dtype=bool)
     hole[40:60, 50:70] = True
     frames = [replace(f, temperature_c=np.where(hole, np.nan, f.temperature_c)) for f in capture.frames]
-    found = estimate_drift(frames, capture.thermal, capture.visible_to_thermal)
+    found = estimate_drift(sample_shared_points(frames, capture.thermal, capture.visible_to_thermal))
     assert found.used
     assert np.abs(found.offsets_k - capture.offsets_k).max() < 0.1
     size = capture.thermal.width, capture.thermal.height
@@ -91,10 +91,10 @@ def test_images_are_corrected_by_what_was_put_into_them_where_they_have_a_temper
 @pytest.mark.parametrize("seed", range(3))
 def test_what_helps_only_the_points_it_was_fitted_to_or_lies_far_below_the_noise_is_no_drift(seed) -> None:
     """80 offsets take 9 % out of the noise of 600 readings; offsets of 0.01 K beside 0.05 K gain 2 %."""
-    alone = drift_of_samples(readings(np.zeros(80), points=150, seed=seed))
+    alone = estimate_drift(readings(np.zeros(80), points=150, seed=seed))
     offsets_k = 0.01 * np.random.default_rng(seed).standard_normal(12)
-    small = drift_of_samples(readings(offsets_k, points=4000, seed=seed))
+    small = estimate_drift(readings(offsets_k, points=4000, seed=seed))
     assert not alone.used and not alone.offsets_k.any() and alone.radial == ()
     assert alone.before_k == alone.after_k == pytest.approx(0.05 * np.sqrt(2.0) * 0.6745, rel=0.15)
     assert not small.used and "at points it was not fitted to" in small.explanation
-    assert drift_of_samples(readings(5.0 * offsets_k, points=4000, seed=seed)).used
+    assert estimate_drift(readings(5.0 * offsets_k, points=4000, seed=seed)).used

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import KnownCapture, changes_between, drawn_capture, known_capture, painted_sky
-from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.drift import estimate_drift, sample_shared_points
 from thermoxels_ns.capture.rig.images import local_contrast, without_fixed_pattern
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import read_rig
@@ -134,13 +134,13 @@ def test_turn_focal_length_and_offsets_are_known() -> None:
     assert capture.turn_error_deg(found) < 0.2
     assert capture.focal_error(found) < 0.01
     assert capture.projection_error_px(found) < 0.17
-    drift = estimate_drift(capture.frames, found.thermal_camera, found.visible_to_thermal)
+    drift = estimate_drift(sample_shared_points(capture.frames, found.thermal_camera, found.visible_to_thermal))
     assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1
 
 
 def test_points_that_lie_together_do_not_decide_an_offset() -> None:
     capture, _ = drawn_capture("courtyard", 2, 120, 0.05, 72, FRAMES)  # 0.15 K from a thousand points of each frame
-    drift = estimate_drift(capture.frames, capture.thermal, capture.visible_to_thermal)
+    drift = estimate_drift(sample_shared_points(capture.frames, capture.thermal, capture.visible_to_thermal))
     assert drift.used, drift.explanation
     assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1
 
@@ -163,6 +163,6 @@ def test_points_and_offsets_are_sure_and_each_number_as_sure_as_stated() -> None
     true_changes = changes_between(start, capture.thermal, capture.visible_to_thermal)
     off = changes_between(start, found.thermal_camera, found.visible_to_thermal) - true_changes
     assert np.all(np.abs(off) < 3.0 * errors), dict(zip(PARAMETERS, off / errors))
-    drift = estimate_drift(capture.frames, found.thermal_camera, found.visible_to_thermal)
+    drift = estimate_drift(sample_shared_points(capture.frames, found.thermal_camera, found.visible_to_thermal))
     assert drift.used, drift.explanation
     assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1

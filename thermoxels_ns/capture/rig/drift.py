@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.sparse import csr_matrix
 
@@ -31,9 +30,7 @@ _SMOOTH_SHARE = 0.4
 _BORDER_PX = 2.0
 
 
-def estimate_drift(
-    frames: Sequence[RigFrame], thermal_camera: Camera, visible_to_thermal: npt.ArrayLike
-) -> DriftEstimate:
+def estimate_drift(samples: DriftSamples) -> DriftEstimate:
     """Return one offset per thermal image and a radial term, if they make the readings of scene points agree better.
 
     An uncooled camera reads some kelvin too high or too low from image to image, and warmer or colder towards the
@@ -43,21 +40,11 @@ def estimate_drift(
     iteratively reweighted). As a test, they are first fitted to four fifths of the points. If this does not lower the
     differences at the other points, the result has offsets of zero, `used` False and the reason.
     """
-    return drift_of_samples(sample_shared_points(frames, thermal_camera, np.asarray(visible_to_thermal, np.float64)))
-
-
-def _no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
-    """Return a `DriftEstimate` without correction for `frames` thermal images; `why` is its explanation."""
-    return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
-
-
-def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
-    """Return the drift that explains the readings of scene points in `samples`, as `estimate_drift` describes."""
     frames = samples.num_frames
     points = int(samples.point[-1]) + 1 if len(samples.point) else 0
     if points < _FEWEST_POINTS:
         seen = f"only {points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
-        return _no_drift(frames, f"No correction: {seen}.")
+        return DriftEstimate(np.zeros(frames), (), np.nan, np.nan, False, f"No correction: {seen}.")
     point, design, difference_k = _differences(samples)
     share = 1.0 / np.bincount(samples.point)[point]  # weight: a point's differences outnumber its readings
     held_out = point % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
@@ -74,7 +61,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
             f"No correction: two images differ by {before_k:.3g} K at shared points, and by {after_k:.3g} K with the "
             "best correction, at points it was not fitted to."
         )
-        return _no_drift(frames, why, before_k)
+        return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
     unknowns = frames + _RADIAL_TERMS * radial
     best = _fit(design[:, :unknowns], difference_k, share, unknowns)
     offsets_k, coefficients = best[:frames] - best[:frames].mean(), best[frames:] if radial else ()
