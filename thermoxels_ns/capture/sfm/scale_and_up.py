@@ -129,10 +129,8 @@ def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tu
     """Return the scale of the weighted least-squares similarity from model to metres, and its residuals (n,), [m]."""
     share = weight / weight.sum()
     a, b = model - share @ model, metres - share @ metres
-    left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    scale = float(size @ sign) / max(float(share @ (a * a).sum(axis=1)), 1e-300)
-    rotated = a @ (left * sign @ right).T
+    rotated = Rotation.align_vectors(b, a, share)[0].apply(a)
+    scale = float(share @ (b * rotated).sum(axis=1)) / max(float(share @ (a * a).sum(axis=1)), 1e-300)
     return scale, np.linalg.norm(b - scale * rotated, axis=1)
 
 
