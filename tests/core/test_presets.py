@@ -7,7 +7,7 @@ import pytest
 from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import read_json, write_json
+from thermoxels_ns.core.json_values import read_json_object, write_json
 from thermoxels_ns.core.yaml_records import read_yaml, with_overrides
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,10 +58,10 @@ def test_yaml_that_cannot_be_used_is_refused(tmp_path, text):
         read_yaml(tmp_path / "a.yaml")
 
 
-@pytest.mark.parametrize("read", [read_yaml, read_json])
+@pytest.mark.parametrize("read", [read_yaml, read_json_object])
 def test_a_key_given_twice_is_found_among_many(tmp_path, read):
     rows = [f'"k{number}": 1' for number in [*range(3000), 7]]
-    text = "{" + ", \n".join(rows) + "}" if read is read_json else "\n".join(rows)
+    text = "{" + ", \n".join(rows) + "}" if read is read_json_object else "\n".join(rows)
     (tmp_path / "a").write_text(text)
     with pytest.raises(ThermoxelsError, match=r"a: expected a .*, got the key k7 twice"):
         read(tmp_path / "a")
@@ -70,7 +70,7 @@ def test_a_key_given_twice_is_found_among_many(tmp_path, read):
 def test_json_keeps_order_names_that_are_not_utf_8_and_degree_signs_and_converts_numpy(tmp_path):
     figures = {"volume": np.float32(0.5), "counts": {"tets": np.int64(6)}, "bounds": np.eye(2), "run": Path("a/b")}
     write_json(tmp_path / "summary.json", {**figures, "unit": "°C", "left_out": "caf\udce9.jpg"})
-    text, read = (tmp_path / "summary.json").read_text(encoding="utf-8"), read_json(tmp_path / "summary.json")
+    text, read = (tmp_path / "summary.json").read_text(encoding="utf-8"), read_json_object(tmp_path / "summary.json")
     assert list(read) == [*figures, "unit", "left_out"] and "°C" in text and '\n "volume": 0.5' in text
     assert (read["counts"], read["bounds"], read["run"]) == ({"tets": 6}, [[1.0, 0.0], [0.0, 1.0]], "a/b")
     assert read["left_out"] == "caf\udce9.jpg"

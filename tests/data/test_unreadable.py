@@ -8,7 +8,7 @@ from tests.support.unreadable import forbid
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.yaml_records import read_yaml
 from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -19,7 +19,7 @@ from thermoxels_ns.training.pipeline import load_checkpoint
 
 READERS = {
     "points.ply": _read_ply,
-    "any.json": read_json,
+    "any.json": read_json_object,
     "any.yaml": read_yaml,
     "thermal.csv": read_thermogram,
     "thermal.jpg": read_thermogram,

@@ -15,7 +15,7 @@ from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import read_json, read_json_object
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
 from thermoxels_ns.reports.page import build_page, colours, gradient, image_file
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
@@ -140,7 +140,7 @@ def demo_page(
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
     photographs = sorted((drawn / "images").glob("frame_train_*"))
     held_out = sorted(path.stem for path in (drawn / "images").glob("frame_eval_*"))
-    bounds = read_json(drawn / "temperature_bounds.json")
+    bounds = read_json_object(drawn / "temperature_bounds.json", _AGAIN)
     with plain_os_errors(folder, "a picture that the demo's commands write", _AGAIN, ThermoxelsError):
         inputs = []
         for number in range(_INPUTS_SHOWN):

@@ -50,22 +50,6 @@ def write_json(path: Path, content: Any) -> None:
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
-def read_json(
-    path: Path,
-    expected: str = "a file of json",
-    remedy: str = "Write it again, or pass another file.",
-    error: type[ThermoxelsError] = ThermoxelsError,
-) -> Any:
-    """Return the content of a json file; raises `error` if the file is missing or damaged or repeats a key. `expected`
-    and `remedy` are parts of the message about a missing or damaged file."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
-    except (OSError, ValueError, RecursionError) as problem:
-        if isinstance(problem, OSError) and path.exists():
-            expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
-        raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
-
-
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs of a json object as a dictionary; raise ValueError for a key that occurs twice."""
     found = dict(pairs)
@@ -75,9 +59,18 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:
-    """Return the object in a json file; raises `error` if the file is missing or damaged or holds another value."""
-    content = read_json(path, "a readable json file", remedy, error)
+def read_json_object(
+    path: Path, remedy: str = "Write it again, or pass another file.", error: type[ThermoxelsError] = ThermoxelsError
+) -> dict[str, Any]:
+    """Return the object in a json file; raises `error`, with the advice `remedy`, if the file is missing or damaged,
+    repeats a key, or holds another value."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
+    except (OSError, ValueError, RecursionError) as problem:
+        expected = "a readable json file"
+        if isinstance(problem, OSError) and path.exists():
+            expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
+        raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
     if not isinstance(content, dict):
         raise error(str(path), expected="a json object", got=type(content).__name__, remedy=remedy)
     return content

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +15,7 @@ from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, guessed_rig
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 
 _MOST_ERROR_PX = 4.0  # scene points with a larger mean reprojection error are ignored, [pixels of the photographs]
@@ -96,9 +95,9 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     Lengths are converted if both captures have a scale; `metres_per_unit` is this capture's (None: it has none). Raises
     `ThermoxelsError` if the file is bad, or if the thermal image's size there is not `thermal_size` (width, height).
     """
-    content: Any = read_json(file)
-    if not isinstance(content, dict) or not isinstance(content.get("thermal_camera"), dict):
-        remedy = "Pass the transforms.json of an earlier capture with the same camera."
+    remedy = "Pass the transforms.json of an earlier capture with the same camera."
+    content = read_json_object(file, remedy)
+    if not isinstance(content.get("thermal_camera"), dict):
         raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got="neither or one", remedy=remedy)
     camera = read_intrinsics(content["thermal_camera"], {}, None, f"{file.name}: thermal_camera")
     transform = read_pose(content.get("rig"), f"{file}: rig")
