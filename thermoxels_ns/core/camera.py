@@ -110,19 +110,15 @@ class Camera:
         return np.column_stack([plane, np.ones(len(plane))])
 
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
-        """Return unit ray directions in world axes through a regular grid of points in each pixel. Distortion is
-        ignored. The result has shape (height, width, samples_per_axis^2, 3)."""
+        """Return unit ray directions in world axes through a regular grid of points in each pixel. The result has the
+        shape (height, width, samples_per_axis^2, 3)."""
         s = samples_per_axis
-        x = (np.arange(self.width * s) + 0.5) / s
-        y = (np.arange(self.height * s) + 0.5) / s
-        local = np.empty((self.height * s, self.width * s, 3))
-        local[..., 0] = (x - self.cx) / self.fl_x
-        local[..., 1] = -(y[:, None] - self.cy) / self.fl_y
-        local[..., 2] = -1.0
-        local /= np.sqrt(np.einsum("ijk,ijk->ij", local, local))[..., None]
+        x, y = ((np.arange(length * s) + 0.5) / s for length in (self.width, self.height))
+        local = self.rays(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)) * (1.0, -1.0, -1.0)
+        local /= np.sqrt(np.einsum("ij,ij->i", local, local))[:, None]
         world = local @ np.asarray(pose, dtype=np.float64)[:3, :3].T
         blocks = world.reshape(self.height, s, self.width, s, 3).transpose(0, 2, 1, 3, 4)
-        return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
+        return blocks.reshape(self.height, self.width, s * s, 3)
 
     def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> BoolArray:
         """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge, (n,); NaN: False."""
