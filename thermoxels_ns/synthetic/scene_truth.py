@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,33 +82,6 @@ class CameraWalk:
         return look_at(position, aim)
 
 
-def ring_poses(
-    rings: Sequence[CameraRing | CameraWalk], num_train: int, num_eval: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return camera-to-world poses of training cameras (num_train, 4, 4) and of evaluation cameras (num_eval, 4, 4).
-
-    Cameras are dealt out to the rings in turn. On a ring, training cameras are evenly spaced; each ring starts a
-    fraction of a step later than the ring before. Evaluation cameras divide gaps between training cameras evenly.
-    Raises `SceneError` if `num_train` is below 1 or `num_eval` below 0.
-    """
-    if num_train < 1 or num_eval < 0:
-        expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"
-        raise SceneError("number of views", expected=expected, got=got, remedy="Raise num_train or num_eval.")
-    used = rings[: min(len(rings), num_train)]
-    train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
-    for number, ring in enumerate(used):
-        slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
-        phase = 0.25 + 0.5 * (number + 0.5) / len(used)
-        gaps = slots if ring.closed else max(slots - 1, 1)
-        for slot in range(slots):
-            train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
-        chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]
-        for q, gap in enumerate(chosen):
-            within = (chosen[:q].count(gap) + 1) / (chosen.count(gap) + 1)
-            held_out[number + q * len(used)] = ring.pose((gap + phase + within) / slots)
-    return np.array(train), np.array(held_out).reshape(-1, 4, 4)
-
-
 @dataclass(frozen=True, eq=False)
 class Body:
     """A solid with the colour and temperature of its surface."""
@@ -151,5 +124,25 @@ class SyntheticScene(Body):
         return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
     def poses(self, num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
-        """Return the training poses (num_train, 4, 4) and held-out poses (num_eval, 4, 4), see `ring_poses`."""
-        return ring_poses(self.rings, num_train, num_eval)
+        """Return camera-to-world poses of training (num_train, 4, 4) and of evaluation cameras (num_eval, 4, 4).
+
+        Cameras are dealt out to the rings in turn. On a ring, training cameras are evenly spaced; each ring starts a
+        fraction of a step later than the ring before. Evaluation cameras divide gaps between training cameras evenly.
+        Raises `SceneError` if `num_train` is below 1 or `num_eval` below 0.
+        """
+        if num_train < 1 or num_eval < 0:
+            expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"
+            raise SceneError("number of views", expected=expected, got=got, remedy="Raise num_train or num_eval.")
+        used = self.rings[:num_train]
+        train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
+        for number, ring in enumerate(used):
+            slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
+            phase = 0.25 + 0.5 * (number + 0.5) / len(used)
+            gaps = slots if ring.closed else max(slots - 1, 1)
+            for slot in range(slots):
+                train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
+            chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]
+            for q, gap in enumerate(chosen):
+                within = (chosen[:q].count(gap) + 1) / (chosen.count(gap) + 1)
+                held_out[number + q * len(used)] = ring.pose((gap + phase + within) / slots)
+        return np.array(train), np.array(held_out).reshape(-1, 4, 4)
