@@ -26,8 +26,6 @@ class Imperfections:
     """Standard deviation of the gain of each channel of each photograph, relative to 1."""
     noise_counts: float = 0.0
     """Standard deviation of the noise in every pixel of the photographs, [counts of 255]."""
-    jpeg_quality: int = 92
-    """Quality of JPEG files, 1 to 95."""
     pose_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which given poses are turned, [degrees]. Given positions are
     also moved: along each axis by a second such angle, in radians, times the distance to the scene's middle."""
@@ -47,8 +45,7 @@ class Imperfections:
     def __post_init__(self) -> None:
         limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
         limits |= {"passers_by": (0.0, 1.0, "from 0 to 1"), "pose_correlation": (0.0, 0.999, "from 0 to 0.999")}
-        limits |= {"focal_error": (-0.5, 1.0, "from -0.5 to 1")}
-        limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
+        limits |= {"focal_error": (-0.5, 1.0, "from -0.5 to 1"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
         check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
 
 
@@ -68,10 +65,10 @@ class DrawnFlaws:
     def __init__(self, flaws: Imperfections, seed: int, poses: FloatArray, middle: npt.ArrayLike):
         self.flaws, self._seed, self._poses = flaws, seed, poses
         count, keep = len(poses), flaws.pose_correlation
-        stops, balance = self._normal(count, 1, stream=2), self._normal(count, 3, stream=3)
+        stops, balance = self._normal(count, 1, stream=(2,)), self._normal(count, 3, stream=(3,))
         self.gains = 2.0 ** (flaws.exposure_stops * stops) * (1.0 + flaws.white_balance * balance)  # (n, 3)
-        self.drifts_k = flaws.drift_k * np.random.default_rng([seed, 0]).standard_normal(count)
-        errors = self._normal(count, 6, stream=4)
+        self.drifts_k = flaws.drift_k * self._normal(count, stream=(0,))
+        errors = self._normal(count, 6, stream=(4,))
         for number in range(1, count):
             errors[number] = keep * errors[number - 1] + np.sqrt(1.0 - keep * keep) * errors[number]
         errors *= np.deg2rad(flaws.pose_error_deg)
@@ -79,11 +76,9 @@ class DrawnFlaws:
         self.turns_rad, self._moves = errors[:, :3], errors[:, 3:] * far[:, None]  # about, and along, each axis
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
-    def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
-        """Return standard normal numbers of the given shape from a stream of its own for each `stream` and `number`."""
-        return np.random.default_rng(
-            [self._seed, stream] if number is None else [self._seed, stream, number]
-        ).standard_normal(shape)
+    def _normal(self, *shape: int, stream: tuple[int, ...]) -> FloatArray:
+        """Return standard normal numbers of the given shape from a stream of its own for each `stream`."""
+        return np.random.default_rng([self._seed, *stream]).standard_normal(shape)
 
     def given_poses(self) -> FloatArray:
         """Return the true poses with the drawn errors, (n, 4, 4), camera to world: the scene folder states these."""
@@ -123,7 +118,7 @@ class DrawnFlaws:
             place = np.random.default_rng([self._seed, 7, number]).random(3)[2]
             seen[_passer_by(shape, place)] = _PASSER_BY[1]
         seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest") + self.drifts_k[number]
-        seen += flaws.noise_k * self._normal(*shape, stream=1, number=number)
+        seen += flaws.noise_k * self._normal(*shape, stream=(1, number))
         return seen
 
     def truth(self) -> dict[str, object]:

@@ -25,7 +25,7 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _Frames = list[dict[str, Any]]
 LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
-PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
+PhotoFormat = Literal["jpg", "png"]  # JPEG as cameras write; PNG, which loses nothing
 
 _IN_DEGREES = ("nerfstudio", "thermalmix")  # layouts with thermal images as .npy [C]; all others have 16-bit PNG
 _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
@@ -41,7 +41,7 @@ _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
 _BOUNDS, _JSON = "temperature_bounds.json", "transforms.json"
 _SAME_POINT = 1e-6  # tolerance for rounding, as a share of the distance from the camera to a point
 _POINTS_PER_VIEW = 50  # number of random pixels in each view whose surface points are put into the COLMAP model
-_PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
+_JPEG_QUALITY = 92
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
 _MOST_SIDE = 4096  # most pixels along a side of an image: all rays of an image are in memory at once
@@ -60,7 +60,7 @@ def write_scene(
     height: int = 240,
     seed: int = 0,
     own_thermal_camera: bool = False,
-    photo_format: PhotoFormat = "jpeg",
+    photo_format: PhotoFormat = "jpg",
     imperfections: Imperfections = PERFECT,
     progress: bool = True,
     layout: LayoutName = "thermoscenes",
@@ -106,14 +106,14 @@ def write_scene(
         measured_c = flaws.thermogram(number, thermal_view.temperature_c)
         side = "train" if number < num_train else "test"
         frame: dict[str, Any] = {
-            "file_path": f"{photographs.format(side)}/{name}{_PHOTO_SUFFIXES[photo_format]}",
+            "file_path": f"{photographs.format(side)}/{name}.{photo_format}",
             "thermal_file_path": f"{thermals.format(side)}/{name}{suffix}",
             "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
             frame["thermal_transform_matrix"] = (given_poses[number] @ offset).tolist()
         with replace_when_done(target / frame["file_path"]) as path:
-            Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
+            Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=_JPEG_QUALITY)
         frames.append(frame)
         if not thermals:
             continue
