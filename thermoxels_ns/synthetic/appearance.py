@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.synthetic.solids import Box
@@ -32,29 +33,22 @@ class SolidTexture:
         draw = np.random.default_rng(seed)
         self._lo = np.asarray(box[0], dtype=np.float64)
         voxel = float(np.subtract(box[1], box[0]).max()) / _REFERENCE_RESOLUTION
-        self._octaves: list[tuple[float, float, int, Float32Array]] = []
+        self._octaves: list[tuple[float, float, Float32Array]] = []
         for spacing, amplitude in zip(_SPACINGS_VOXELS, _AMPLITUDES):
             size = int(np.ceil(_REFERENCE_RESOLUTION / spacing)) + 4
             values = draw.uniform(-1.0, 1.0, (size**3, 3)).astype(np.float32)
-            self._octaves.append((spacing * voxel, amplitude, size, values))
+            self._octaves.append((spacing * voxel, amplitude, values.T.reshape(3, size, size, size)))
 
     def __call__(self, points: npt.ArrayLike) -> Float32Array:
         """Return the deviations of red, green and blue (n, 3) at points (n, 3) [m]: mean about 0, mostly in -1 to 1."""
         relative = np.asarray(points, dtype=np.float64) - self._lo
         noise = np.zeros((len(relative), 3), dtype=np.float32)
-        for spacing, amplitude, size, values in self._octaves:
-            position = (relative / spacing).T
-            corner = np.floor(position)
-            share = (position - corner).astype(np.float32)
-            share = share * share * (3.0 - 2.0 * share)
-            cell = corner.astype(np.int64)
-            (x0, y0, z0), (x1, y1, z1) = cell % size, (cell + 1) % size
-            (fx, fy, fz) = share
-            for i, wx in ((x0, 1.0 - fx), (x1, fx)):
-                for j, wy in ((y0, 1.0 - fy), (y1, fy)):
-                    column, weight = (i * size + j) * size, amplitude * wx * wy
-                    noise += values[column + z0] * (weight * (1.0 - fz))[:, None]
-                    noise += values[column + z1] * (weight * fz)[:, None]
+        for spacing, amplitude, values in self._octaves:
+            corner = np.floor(relative.T / spacing)
+            share = relative.T / spacing - corner
+            place = corner + share * share * (3.0 - 2.0 * share)
+            for channel, grid in enumerate(values):
+                noise[:, channel] += amplitude * ndimage.map_coordinates(grid, place, order=1, mode="grid-wrap")
         return noise @ _CHANNELS_TO_RGB.T
 
 
@@ -109,15 +103,10 @@ def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)
 
 
-def plain(rgb: Sequence[float]) -> Callable[[npt.ArrayLike], Float32Array]:
-    """Return a background of one colour (red, green, blue, 0 to 1): a function of directions (n, 3) to (n, 3)."""
-    colour = np.asarray(rgb, dtype=np.float32)
-    return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
-
-
-def everywhere(degrees_c: float) -> Callable[[npt.ArrayLike], FloatArray]:
-    """Return a background of one temperature [C]: a function of directions (n, 3) to temperatures (n,)."""
-    return lambda directions: np.full(len(np.asarray(directions)), degrees_c)
+def plain(value: npt.ArrayLike) -> Callable[..., npt.NDArray]:
+    """Return a background of one colour (red, green, blue, 0 to 1) or of one temperature [C]: a function of directions
+    (n, 3) to colours (n, 3) or temperatures (n,)."""
+    return lambda directions: np.full((len(np.asarray(directions)), *np.shape(value)), value)
 
 
 def sky_rgb(directions: npt.ArrayLike) -> Float32Array:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.appearance import Paint, SunLight, everywhere, plain, room_rgb, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.appearance import Paint, SunLight, plain, room_rgb, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
 from thermoxels_ns.synthetic.random_scene import (
     painted_scene,
@@ -301,7 +301,7 @@ def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float =
 
 def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
     """Return a scene of a plan. By default, its background is a room at the lower of its `temperature_bounds_c`."""
-    room = {"background_rgb": room_rgb, "background_temperature_c": everywhere(fields["temperature_bounds_c"][0])}
+    room = {"background_rgb": room_rgb, "background_temperature_c": plain(fields["temperature_bounds_c"][0])}
     return painted_scene(plan, light=light, **(room | fields))
 
 
@@ -342,7 +342,7 @@ def wall_object() -> SyntheticScene:
         name="wall-object",
         temperature_bounds_c=(_ROOM_C, 45.0),
         background_rgb=plain(paint.base),
-        background_temperature_c=everywhere(_ROOM_C),
+        background_temperature_c=plain(_ROOM_C),
         rings=rings_around(
             (0.04, 0.0), (0.52, 1.75, 0.25), (0.52, 1.85, 0.8), (0.5, 1.65, 1.45), start_deg=-160.0, span_deg=140.0
         ),

@@ -16,7 +16,6 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.synthetic.appearance import (
     SolidTexture,
     SunLight,
-    everywhere,
     painted,
     plain,
     room_rgb,
@@ -173,7 +172,7 @@ def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, fl
     else:
         coldest = room = _degrees(draw.uniform(12.0, 25.0))
         surface = room + float(draw.uniform(0.0, 1.5))
-        degrees = everywhere(room)
+        degrees = plain(room)
     return (surface, coldest + spread), {
         "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32),
         "background_temperature_c": degrees,
