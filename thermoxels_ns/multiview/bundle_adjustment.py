@@ -209,8 +209,8 @@ def _seen(
 ) -> tuple[FloatArray, FloatArray]:
     """Return per sighting the point in camera axes (s, 3), and its projection minus the feature (s, 2), [pixels]."""
     local = np.einsum("nij,nj->ni", rotations[tracks.photograph], points[tracks.point] - centres[tracks.photograph])
-    depth = np.where(np.abs(local[:, 2:]) > 1e-12, local[:, 2:], 1e-12)
-    return local, focal[tracks.photograph, None] * (local[:, :2] / depth - tracks.place)
+    local[np.abs(local[:, 2]) < 1e-12, 2] = 1e-12
+    return local, focal[tracks.photograph, None] * (local[:, :2] / local[:, 2:] - tracks.place)
 
 
 def _distances(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> FloatArray:
@@ -250,21 +250,13 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
     points, _ = _triangulated(tracks, rotations, centres)
     reach = float(np.median(np.linalg.norm(points[tracks.point] - centres[tracks.photograph], axis=1)))
     sightings, scale = len(tracks.point), focal[tracks.photograph]
-    rows = np.arange(2 * sightings)
-
-    def block(values: FloatArray, column: IntArray, width: int, total: int) -> sparse.csr_matrix:
-        columns = (column[:, None] * width + np.arange(width))[:, None, :].repeat(2, axis=1)
-        return sparse.csr_matrix(
-            (values.ravel(), (rows.repeat(width), columns.ravel())), (2 * sightings, width * total)
-        )
-
+    every, rows = np.arange(len(points) + 1), np.arange(sightings + 1)
     for _ in range(_ROUNDS):
         local, off = _seen(tracks, rotations, centres, points, focal)
         far = np.linalg.norm(off, axis=1)
         middle = max(float(np.median(far)), 1e-6)
         root = 1.0 / (1.0 + (far / (_OUTLYING * middle)) ** 2)[:, None]
         x, y, z = local.T
-        z = np.where(np.abs(z) > 1e-12, z, 1e-12)
         by_local, cross = np.zeros((sightings, 2, 3)), np.zeros((sightings, 3, 3))
         by_local[:, 0, 0] = by_local[:, 1, 1] = scale / z
         by_local[:, 0, 2], by_local[:, 1, 2] = -scale * x / z**2, -scale * y / z**2
@@ -272,12 +264,13 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
         cross -= cross.transpose(0, 2, 1)
         by_point = by_local @ rotations[tracks.photograph] * root[..., None]
         by_pose = np.concatenate((-by_local @ cross * root[..., None], -reach * by_point), axis=2)
-        a, b = block(by_pose, tracks.photograph, 6, count), block(by_point, tracks.point, 3, len(points))
+        a = sparse.bsr_array((by_pose, tracks.photograph, rows), shape=(2 * sightings, 6 * count))
+        b = sparse.bsr_array((by_point, tracks.point, rows), shape=(2 * sightings, 3 * len(points)))
         right = (off * root).ravel()
         normal = np.zeros((len(points), 3, 3))
         np.add.at(normal, tracks.point, np.einsum("nki,nkj->nij", by_point, by_point))
         normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        inverse = sparse.block_diag([sparse.coo_array(one) for one in np.linalg.inv(normal)], format="csr")
+        inverse = sparse.bsr_array((np.linalg.inv(normal), every[:-1], every))
         mixed = a.T @ b
         precision = (middle / np.deg2rad(POSE_ERROR_DEG)) ** 2
         turned = Rotation.from_matrix(rotations @ start.transpose(0, 2, 1)).as_rotvec()
@@ -302,8 +295,9 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
 
 def _placed_like(poses: FloatArray, given: FloatArray) -> FloatArray:
     """Return poses after the similarity transform (rotation, scale, shift) that brings them closest to `given`."""
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", given[:, :3, :3], poses[:, :3, :3]))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(given[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).mean().as_matrix()
     here, there = (each[:, :3, 3] - each[:, :3, 3].mean(0) for each in (poses, given))
     here = here @ turn.T
     spread = float((here * here).sum())
