@@ -95,14 +95,6 @@ class Lattice:
         cells = np.stack(np.meshgrid(*map(np.arange, self.cell_shape), indexing="ij"), axis=-1)
         return self.index_to_world(cells + 0.5)
 
-    def corner_to_cell_mean(self, values: npt.NDArray) -> npt.NDArray:
-        """Return the mean of corner values (nx, ny, nz) over each voxel's eight corners, shape `cell_shape`."""
-        total = np.zeros(self.cell_shape, dtype=np.result_type(values.dtype, np.float32))
-        for dx, dy, dz in CORNER_OFFSETS:
-            nx, ny, nz = self.cell_shape
-            total += values[dx : dx + nx, dy : dy + ny, dz : dz + nz]
-        return total / 8.0
-
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
     """Return the matrix (4, 4) that maps world points to input points: the inverse of p = scale * (R p_input + t).

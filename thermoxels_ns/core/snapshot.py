@@ -11,7 +11,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntAr
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 
 SHOWN_WELL = 0.15
 """Least visibility of a place that is shown well, relative to what cameras were pointed at. In nine synthetic scenes
@@ -46,13 +46,10 @@ class Views:
 
     def shows(self, camera: int, directions: FloatArray) -> BoolArray:
         """Return for each direction (..., 3) from the centre of `camera` whether its image shows it, shape (...)."""
-        local = directions @ self.camera_to_world[camera, :, :3]
-        depth = -local[..., 2]
-        ahead = depth > 1e-9
-        scale = 1.0 / np.where(ahead, depth, 1.0)
-        x = self.centre[camera, 0] + self.focal[camera, 0] * local[..., 0] * scale
-        y = self.centre[camera, 1] - self.focal[camera, 1] * local[..., 1] * scale
-        return ahead & (x >= 0) & (x <= self.size[camera, 0]) & (y >= 0) & (y <= self.size[camera, 1])
+        column, row, depth = np.moveaxis(directions @ self.matrices()[camera, :, :3].T, -1, 0)
+        width, height = self.size[camera]
+        inside = (column >= 0) & (column <= width * depth) & (row >= 0) & (row <= height * depth)
+        return inside & (depth > 1e-9)
 
     def shown_well(self, places: FloatArray, reach: FloatArray) -> BoolArray:
         """Return for each place (n, 3) whether photographs show it about as well as the cameras' targets, (n,).
@@ -146,7 +143,9 @@ class GridSnapshot:
         """Return the density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
         if self.voxel_density is not None:
             return self.voxel_density.astype(np.float64)
-        return self.lattice.corner_to_cell_mean(self.density.astype(np.float64))
+        x, y, z = self.lattice.cell_shape
+        corners = self.density.astype(np.float64)
+        return sum(corners[i : i + x, j : j + y, k : k + z] for i, j, k in CORNER_OFFSETS) / 8.0
 
 
 _SMALLEST_FOCAL = 1e-6  # least focal length of a lens, [pixels]

@@ -159,7 +159,7 @@ def test_percentile_keeps_the_densest_share_of_all_voxels(snapshot_of, percentil
     density = np.random.default_rng(0).random((11, 11, 11))
     snapshot = snapshot_of(density)
     solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_percentile=percentile, region="all"))
-    centre = snapshot.lattice.corner_to_cell_mean(snapshot.density)
+    centre = snapshot.centre_density()
     assert solid.cells.sum() == pytest.approx(1000 * (1 - percentile / 100), abs=1)
     assert centre[solid.cells].min() >= solid.threshold > centre[~solid.cells].max()
 
