@@ -135,8 +135,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
 
         `stream` holds bits of `core.feature_rays`. The thermal bit alone gives rays through valid thermal pixels; both
         bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid is the
-        same in each call and has at most `max_rays_per_image` pixels of an image (None: all). Raises `ValueError` for
-        an unknown stream.
+        same in each call and has at most `max_rays_per_image` pixels of an image (None: all).
         """
         return self.train_rays.grid(stream, max_rays_per_image)
 

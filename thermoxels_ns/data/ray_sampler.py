@@ -124,8 +124,6 @@ class RaySampler:
 
     def grid(self, stream: int, max_rays_per_image: int | None) -> Iterator[RayBundle]:
         """Yield bundles of rays through the usable pixels of a grid, see `ThermalDataManager.training_rays`."""
-        if not 0 < stream <= RGB_STREAM | THERMAL_STREAM:
-            raise ValueError(f"no such stream: {stream}")
         wanted = stream & _BITS[self.streams]
         if wanted & RGB_STREAM:
             pixels = self.colour_rays.grid(max_rays_per_image)
@@ -232,8 +230,6 @@ class CameraRays:
         In each image, k is the smallest step that gives at most `most` pixels (None: k = 1). The grid starts in the
         middle of its first cell, so that no border is preferred. Along a side shorter than k, only the middle is used.
         """
-        if most is not None and most < 1:
-            raise ValueError(f"at most {most} rays of an image")
         numbers = []
         for first, width, height in zip(self.first_pixel, self.widths.tolist(), self.heights.tolist()):
             # Rows and columns are rounded up, so the square root alone may give a few pixels too many.
