@@ -122,7 +122,7 @@ class ThermalDataParser(DataParser):
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
     and resolution), ``thermal_unit``, ``image_scale`` (used over original resolution of photographs), ``pixel_size``
     (width of a pixel at the typical distance of surfaces, in nerfstudio's world), ``input_box`` (the scene box in input
-    coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None for val and test, and without tracks).
+    coordinates) and ``feature_rays`` (`FeatureRays`; None for val and test, and without tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
     coordinates), and ``fitted_poses`` of val and test are camera to world in nerfstudio's world, (n, 3, 4); else None.
     """
@@ -240,7 +240,6 @@ class ThermalDataParser(DataParser):
             "thermal_unit": file.unit,
             "pixel_size": scale * pixel_size,
             "input_box": tuple(map(tuple, box.tolist())),
-            "scene_name": file.folder.resolve().name,
         }
         placed = SceneBox(aabb=torch.from_numpy((scale * (box + translation)).astype(np.float32)))
         if rays is not None:
@@ -250,7 +249,7 @@ class ThermalDataParser(DataParser):
         sides = (placed.aabb[1] - placed.aabb[0]).double() * (metres or 1.0) / scale
         size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
-            f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
+            f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, "
             f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {found.source}, {size}; "
             + (f"{temperatures.min_c:.2f} to {temperatures.max_c:.2f} C." if temperatures else "no temperatures.")
         )
@@ -346,19 +345,10 @@ def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) ->
 
 
 def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
-    def column(name: str, kind: torch.dtype) -> torch.Tensor:
-        return torch.tensor([[getattr(one, name)] for one in intrinsics], dtype=kind)
-
-    return Cameras(
-        camera_to_worlds=poses,
-        fx=column("fl_x", torch.float32),
-        fy=column("fl_y", torch.float32),
-        cx=column("cx", torch.float32),
-        cy=column("cy", torch.float32),
-        width=column("width", torch.int64),
-        height=column("height", torch.int64),
-        distortion_params=torch.tensor([one.distortion for one in intrinsics], dtype=torch.float32),
-    )
+    lens = torch.tensor([(c.fl_x, c.fl_y, c.cx, c.cy) for c in intrinsics], dtype=torch.float32)
+    width, height = torch.tensor([(c.width, c.height) for c in intrinsics]).split(1, dim=1)
+    distortion = torch.tensor([c.distortion for c in intrinsics], dtype=torch.float32)
+    return Cameras(poses, *lens.split(1, dim=1), width=width, height=height, distortion_params=distortion)
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
