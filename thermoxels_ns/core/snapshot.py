@@ -145,7 +145,8 @@ class GridSnapshot:
             return self.voxel_density.astype(np.float64)
         x, y, z = self.lattice.cell_shape
         corners = self.density.astype(np.float64)
-        return sum(corners[i : i + x, j : j + y, k : k + z] for i, j, k in CORNER_OFFSETS) / 8.0
+        total = np.asarray(sum(corners[i : i + x, j : j + y, k : k + z] for i, j, k in CORNER_OFFSETS))
+        return total / 8.0
 
 
 _SMALLEST_FOCAL = 1e-6  # least focal length of a lens, [pixels]
