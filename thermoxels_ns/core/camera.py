@@ -47,22 +47,6 @@ class Camera:
             got = f"{self.width} x {self.height} pixels, {numbers}"
             raise SceneError("camera", expected=expected, got=got, remedy=remedy)
 
-    @classmethod
-    def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
-        """Return a camera with square pixels, its principal point at the image centre, and this angle of view.
-
-        Raises `SceneError` unless the angle is above 0 and below 179 degrees.
-
-        >>> round(Camera.from_field_of_view(640, 480, 90.0).fl_x, 6)
-        320.0
-        """
-        if not 0.0 < horizontal_deg < 179.0:
-            remedy = "Pass the horizontal angle of view from the lens's data sheet."
-            got = horizontal_deg
-            raise SceneError("field of view", expected="an angle above 0 and below 179 degrees", got=got, remedy=remedy)
-        focal = 0.5 * width / math.tan(math.radians(0.5 * horizontal_deg))
-        return cls(width, height, focal, focal, 0.5 * width, 0.5 * height)
-
     @property
     def distortion(self) -> tuple[float, float, float, float, float, float]:
         """Distortion coefficients k1, k2, k3, k4, p1, p2, in nerfstudio's order."""

@@ -14,6 +14,7 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, guessed_rig
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import check_ranges
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
@@ -58,12 +59,17 @@ def rig_start(
     def centred(focal_px: float) -> Camera:
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2)
 
+    def seen_under(angle_deg: float) -> Camera:
+        return centred(0.5 * width / math.tan(math.radians(0.5 * angle_deg)))
+
     lens = [frame.thermal_focal_px for frame in frames if frame.thermal_focal_px]
     flir = [frame.metadata.picture_in_picture for frame in frames if frame.metadata.picture_in_picture]
     angles = [frame.metadata.field_of_view_deg for frame in frames if frame.metadata.field_of_view_deg]
     angles = [angle for angle in angles if _BELIEVED_DEG[0] < angle < _BELIEVED_DEG[1]]
     if field_of_view_deg is not None:
-        camera = Camera.from_field_of_view(width, height, field_of_view_deg)
+        limits = (field_of_view_deg, 0.1, 179.0, "from 0.1 to 179 degrees, as in the lens's data sheet")
+        check_ranges("--", {"thermal_field_of_view_deg": limits})
+        camera = seen_under(field_of_view_deg)
         sigma, source = _FROM_USER, f"the angle of view that was given, {field_of_view_deg:g} degrees"
     elif lens:
         focal = median(lens)
@@ -80,7 +86,7 @@ def rig_start(
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:
         angle = median(angles)
-        camera = Camera.from_field_of_view(width, height, angle)
+        camera = seen_under(angle)
         sigma, source = _FROM_ANGLE, f"the thermal files' angle of view, {angle:g} degrees"
     else:
         camera = centred(visible.fl_x * width / visible.width)
