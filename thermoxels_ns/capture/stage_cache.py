@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 
 from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.radiometry.decoders import errors_name
@@ -77,7 +78,10 @@ def prepare_output(folder: Path) -> Path:
 
 def save_rig(path: Path, rig: RigEstimate) -> None:
     """Write a rig as .npz, atomically."""
-    write_npz(path, {**vars(rig), "thermal_camera": np.array(astuple(rig.thermal_camera))})
+    packed = io.BytesIO()  # on a full disk, numpy's archive object would raise a second error when it is deleted
+    np.savez_compressed(packed, **{**vars(rig), "thermal_camera": np.array(astuple(rig.thermal_camera))})
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(packed.getvalue())  # no view: one in an error's traceback crashed Python 3.12
 
 
 def load_rig(path: Path) -> RigEstimate:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -167,33 +166,11 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays by name to a compressed .npz file, whole or not at all; raises `OutputError` if that fails.
-
-    The file is packed in memory first. If numpy wrote to a full disk instead, its archive object would raise a second
-    error when it is deleted.
-    """
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **arrays)
-    with replace_when_done(path) as temporary:
-        temporary.write_bytes(packed.getvalue())  # no view: one in an error's traceback crashed Python 3.12
-
-
 def remove_file(path: Path | str) -> None:
     """Remove a file if it exists, or raise `OutputError` if that fails."""
     file = Path(path)
     with plain_os_errors(file.name, f"a file that can be removed at {file}", _IN_THE_WAY, always_what=True):
         file.unlink(missing_ok=True)
-
-
-def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
-    """Raise `OutputError` if one of `files` in `folder` is a folder, or if one of `folders` in it is a file."""
-    blocked = [name for name in files if (folder / name).is_dir()]
-    blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
-    if blocked:
-        expected = f"no folder in the place of a file, and no file in the place of a folder, in {folder}"
-        remedy = "Move it away, or choose another folder."
-        raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
 
 
 def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
@@ -207,7 +184,12 @@ def result_folder(path: Path | str, files: Sequence[str], first: str, series: st
         series: Pattern of result files in a subfolder, such as ``heat/step-*.vtu``; None: there are none.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
-    refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])
+    blocked = [name for name in files if (folder / name).is_dir()]
+    blocked += [name for one in steps if (folder / (name := Path(one).parent.name)).is_file()]
+    if blocked:
+        expected = f"no folder in the place of a file, and no file in the place of a folder, in {folder}"
+        remedy = "Move it away, or choose another folder."
+        raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
     there = [next(folder.glob(name), None) for name in (*files, *steps)]
     found = [one.relative_to(folder).as_posix() for one in there if one is not None]
     if found and first not in found:
