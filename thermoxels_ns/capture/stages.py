@@ -119,7 +119,7 @@ def _captured(
         scale, missing = scale_from_gps(found.centres, [frame.gps for frame in frames])
     metres = None if scale is None else scale.metres_per_unit
     say(f"scale: {missing}" if metres is None else f"scale: {metres:.5g} m per unit")
-    model, up = upright(found, frames)
+    model, up, moved = upright(found, frames)
     start = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
     in_rig = rig_frames(model, frames)
     if settings.rig is not None:
@@ -139,7 +139,6 @@ def _captured(
     say(f"rig: {rig.explanation}")
     drift = estimate_drift(sample_shared_points(in_rig, rig.thermal_camera, rig.visible_to_thermal))
     say(f"drift: {drift.explanation}")
-    moved = model.camera_to_world[0] @ np.linalg.inv(found.camera_to_world[0])
     scene = Scene(frames, model, kept / "poses" / MODEL_FOLDER, moved, rig, drift, scale, up)
     write_scene_folder(scene, output, say)
     dropped = search.unpaired | read.dropped | alone

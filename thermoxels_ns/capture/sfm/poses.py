@@ -103,9 +103,8 @@ def _reduced(
             if small != size:
                 much = max(small) < 0.5 * max(size)
                 picture = picture.resize(small, Image.Resampling.BOX if much else Image.Resampling.LANCZOS)
-            temporary = images / f".{file}"
-            picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
-            temporary.replace(images / file)
+            with replace_when_done(images / file) as temporary:
+                picture.save(temporary, quality=_JPEG_QUALITY)
     return files, small
 
 

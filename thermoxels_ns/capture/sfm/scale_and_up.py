@@ -155,18 +155,18 @@ class Up:
     source: str  # sentence for the report that says how the direction was found
 
 
-def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, Up]:
-    """Return the model in axes with z up, y ahead of the cameras and the origin amid the scene points; and up in them.
-
-    `frames` must be the frames of `model`, in its order.
-    """
+def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, Up, FloatArray]:
+    """Return the model in axes with z up, y ahead of the cameras and the origin amid the scene points; up in them; and
+    the matrix (4, 4) from the old axes to them. `frames` must be the frames of `model`, in its order."""
     up = find_up(model.camera_to_world, [one.gimbal_deg for one in frames], [one.orientation for one in frames])
     ahead = -model.camera_to_world[:, :3, 2].mean(axis=0)
     # The infinite weight turns up to z exactly; ahead then comes as near to y as it can.
     turn = Rotation.align_vectors([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], [up.direction, ahead], [np.inf, 1.0])[0]
-    rotation = turn.as_matrix()
+    move, rotation = np.eye(4), turn.as_matrix()
     origin = np.median(model.points, axis=0) if len(model.points) else model.centres.mean(axis=0)
-    return model.moved(rotation, origin), replace(up, direction=rotation @ up.direction)
+    move[:3, :3], move[:3, 3] = rotation, -rotation @ origin
+    moved = replace(model, camera_to_world=move @ model.camera_to_world, points=(model.points - origin) @ rotation.T)
+    return moved, replace(up, direction=rotation @ up.direction), move
 
 
 def find_up(

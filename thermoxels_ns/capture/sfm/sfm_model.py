@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -39,13 +39,6 @@ class SfmModel:
         """Return world points (m, 3) in a frame's camera axes x right, y down, z ahead, shape (m, 3)."""
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
-
-    def moved(self, rotation: FloatArray, origin: FloatArray) -> SfmModel:
-        """Return the model in new axes: p_new = rotation (p - origin), with `rotation` (3, 3) and `origin` (3,)."""
-        poses = self.camera_to_world.copy()
-        poses[:, :3, :3] = rotation @ poses[:, :3, :3]
-        poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ rotation.T
-        return replace(self, camera_to_world=poses, points=(self.points - origin) @ rotation.T)
 
 
 class SparseDepth:
