@@ -72,11 +72,6 @@ class RigEstimate:
         """Standard error of the rotation about all axes together [degrees]; NaN if the covariance is unknown."""
         return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
-    def thermal_pose(self, camera_to_world: npt.ArrayLike) -> FloatArray:
-        """Return the thermal camera's pose for a pose of the visible camera, both (4, 4) in OpenGL axes."""
-        pose = np.asarray(camera_to_world, dtype=np.float64)
-        return pose @ OPENGL_FROM_OPENCV @ np.linalg.inv(self.visible_to_thermal) @ OPENGL_FROM_OPENCV
-
 
 def guessed_rig(
     camera: Camera,
@@ -106,11 +101,6 @@ class RigModel:
     transform: FloatArray  # visible to thermal camera, shape (4, 4), OpenCV axes
     pixel_share: float = 1.0
     """Pixels at this size per pixel of the full thermal image. The changes cx and cy are pixels of the full image."""
-
-    def at_size(self, width: int, height: int) -> RigModel:
-        """Return the same start for a thermal image of another size."""
-        share = width / self.camera.width * self.pixel_share
-        return RigModel(self.camera.resized(width, height), self.transform, share)
 
     def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
         """Return the thermal camera and `transform` after the ten changes `PARAMETERS`, given as `change` (10,)."""

@@ -13,7 +13,7 @@ from PIL import Image
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.sfm.poses import scene_names
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -76,11 +76,12 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
     temperature_c = scene.drift.corrected(number, np.load(frame.thermal))
     Image.fromarray(temperature_c).save(folder / "thermal" / f"{name}.tiff")
     pose = scene.model.camera_to_world[number]
+    thermal_pose = pose @ OPENGL_FROM_OPENCV @ np.linalg.inv(scene.rig.visible_to_thermal) @ OPENGL_FROM_OPENCV
     return {
         "file_path": f"images/{photograph.name}",
         "thermal_file_path": f"thermal/{name}.tiff",
         "transform_matrix": pose.tolist(),
-        "thermal_transform_matrix": scene.rig.thermal_pose(pose).tolist(),
+        "thermal_transform_matrix": thermal_pose.tolist(),
         "source": frame.name,
         "thermal_source": frame.thermal_source,
     }

@@ -37,7 +37,6 @@ _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
 _BORDER_PX, _BORDER_SHARE = 2.0, 0.05
-_PADDING = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +54,11 @@ class ThermalEdges:
         """Store edge values `field` (height, width), their derivatives, and weights that fall to 0 at the border."""
         self.field = field
         self.weight: Float32Array = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
-        padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
-        self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
+        self._planes = field, np.gradient(field, axis=1), np.gradient(field, axis=0)
 
     def sample(self, pixels: FloatArray) -> npt.NDArray[np.complex64]:
         """Return edge values and their derivatives by x and y, (3, n), at pixel positions (n, 2); outside: 0."""
         return np.stack([_bilinear(plane, pixels) for plane in self._planes])
-
-    def weight_at(self, pixels: FloatArray) -> FloatArray:
-        """Return the weights (n,), 0 at the image's border to 1, of points at pixel positions (n, 2)."""
-        return _bilinear(np.pad(self.weight, _PADDING), pixels).astype(np.float64)
 
 
 class RigScore:
@@ -82,7 +76,9 @@ class RigScore:
     ) -> None:
         """Store the edges of each frame and the start `rig`; weights are computed at the ten changes `around` (10,)."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
-        self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
+        self._weights = [
+            _bilinear(t.weight, rig.project(around, e.points)).astype(float) for e, t in zip(edges, thermal)
+        ]
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
         """Return the score at the ten changes `change` (10,), and each frame's part of its derivative, (frames, 10)."""
@@ -122,7 +118,7 @@ class PreparedFrames:
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
         """Return the `RigScore` for thermal images of `size` (width, height), with weights at the ten changes `change`.
         `blur_px` is the standard deviation of the edges' blur [thermal pixels at that size]."""
-        level = rig.at_size(*size)
+        level = RigModel(rig.camera.resized(*size), rig.transform, size[0] / rig.camera.width)
         edges, thermal = [], []
         for frame in self.frames:
             small = cv2.resize(frame.contrast, size, interpolation=cv2.INTER_AREA)
@@ -244,10 +240,10 @@ def local_contrast(image: FloatImage) -> FloatImage:
     return np.where(known, filled - around, np.nan).astype(np.float32)
 
 
-def _bilinear(padded: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
-    """Return bilinear samples (n,) of a plane padded by `_PADDING` zeros, at `pixels` (n, 2) of it unpadded; NaN: 0."""
-    place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T + (_PADDING - 0.5)
-    return ndimage.map_coordinates(padded, place, order=1, mode="nearest")
+def _bilinear(plane: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
+    """Return bilinear samples (n,) of a plane, which is 0 outside, at pixel positions (n, 2); NaN: 0."""
+    place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
+    return ndimage.map_coordinates(plane, place, order=1, mode="grid-constant")
 
 
 def _ramp(length: int) -> FloatArray:

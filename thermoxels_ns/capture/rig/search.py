@@ -8,7 +8,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import approx_fprime
 
 from thermoxels_ns.capture.rig.images import EdgePoints, PreparedFrames, RigScore, prepare_frames
@@ -155,7 +154,9 @@ def search_coarsely(score: RigScore, sigmas: FloatArray, median_depth: float) ->
         phases = [np.exp(2j * np.pi * draw.random(weight.shape)) for _ in chosen]
         templates.append([np.fft.ifft2(np.fft.fft2(field) * phase) for field, phase in zip(templates[0], phases)])
     strengths = [sum(float(np.sum(weight * np.abs(field) ** 2)) for field in fields) for fields in templates]
-    weighted = [[_planes(field * weight) for field in fields] for fields in templates]
+    weighted = [
+        [(field * weight).astype(np.complex64)[..., None].view(np.float32) for field in fields] for fields in templates
+    ]
     turn = np.hypot(sigmas[:2], sigmas[3:5][::-1] / median_depth)[::-1]  # about y moves along x
     most = _LARGEST_REACH_SHARE * np.array([camera.width, camera.height])
     reach = np.ceil(np.minimum(_REACH_SIGMAS * turn * camera.fl_x, most)).astype(np.int64)
@@ -191,10 +192,6 @@ def _drawn(edges: EdgePoints, rig: RigModel, change: FloatArray, reach: IntArray
     place, value = y[inside] * columns + x[inside], edges.value[inside]
     parts = [np.bincount(place, part, rows * columns).reshape(rows, columns) for part in (value.real, value.imag)]
     return np.stack(parts, axis=2).astype(np.float32)
-
-
-def _planes(values: npt.NDArray) -> Float32Array:
-    return np.stack([values.real, values.imag], axis=2).astype(np.float32)
 
 
 def _steps(reach: float, step: float) -> FloatArray:
