@@ -167,12 +167,8 @@ def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
         if image.size != (width, height) or not image.mode.startswith("I"):
             raise ValueError(f"a PNG of {image.size} and mode {image.mode} for {width} x {height} counts")
         counts = np.asarray(image).astype(np.uint16)
-    return min((counts.byteswap(), counts), key=_roughness)
-
-
-def _roughness(counts: npt.NDArray[np.uint16]) -> float:
-    plain = counts.astype(np.float64)
-    return float(np.abs(np.diff(plain, axis=0)).sum() + np.abs(np.diff(plain, axis=1)).sum())
+    orders = counts.byteswap(), counts
+    return min(orders, key=lambda c: sum(np.abs(np.diff(c.astype(float), axis=axis)).sum() for axis in (0, 1)))
 
 
 def _camera_info(record: _Record) -> CameraInfo:

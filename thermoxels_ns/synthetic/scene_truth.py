@@ -47,11 +47,6 @@ class CameraRing:
     start_deg: float = 0.0  # azimuth of the arc's begin, counted from x towards y [degrees]
     span_deg: float = 360.0  # length of the arc [degrees]; 360 closes the ring
 
-    @property
-    def closed(self) -> bool:
-        """True for a full circle. Its last camera is then a neighbour of its first."""
-        return self.span_deg >= 360.0
-
     def pose(self, share: float) -> FloatArray:
         """Return the camera-to-world pose (4, 4) at `share` of the arc, 0 (begin) to 1 (end), see `look_at`."""
         azimuth = math.radians(self.start_deg + self.span_deg * share)
@@ -74,7 +69,6 @@ class CameraWalk:
 
     ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
     aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
-    closed: bool = False  # False: the last camera is no neighbour of the first
 
     def pose(self, share: float) -> FloatArray:
         """Return the camera-to-world pose (4, 4) at `share` of the line, 0 (begin) to 1 (end), see `look_at`."""
@@ -138,7 +132,8 @@ class SyntheticScene(Body):
         for number, ring in enumerate(used):
             slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
             phase = 0.25 + 0.5 * (number + 0.5) / len(used)
-            gaps = slots if ring.closed else max(slots - 1, 1)
+            closed = isinstance(ring, CameraRing) and ring.span_deg >= 360.0  # the last camera stands beside the first
+            gaps = slots if closed else max(slots - 1, 1)
             for slot in range(slots):
                 train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
             chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]
