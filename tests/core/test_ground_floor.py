@@ -121,9 +121,8 @@ def test_corners_and_centres_sit_where_the_house_says():
     np.testing.assert_array_equal(LATTICE.cell_centres()[0, 0, 0], [-0.75, 0.5, 3.25])
     assert LATTICE.num_corners == 60 and LATTICE.cell_shape == (3, 2, 4)
     slope = np.array([1.0, -2.0, 0.5])  # the mean of a linear field is its value at the centre
-    np.testing.assert_allclose(
-        GridSnapshot(LATTICE, *[corners @ slope] * 3).centre_density(), LATTICE.cell_centres() @ slope
-    )
+    snapshot = GridSnapshot(LATTICE, *[corners @ slope] * 3)
+    np.testing.assert_allclose(snapshot.centre_density(), LATTICE.cell_centres() @ slope)
 
 
 @given(

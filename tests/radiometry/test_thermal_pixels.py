@@ -111,10 +111,9 @@ def test_quiet_background_is_not_dead():
 @pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
 def test_a_tiff_of_floating_point_numbers_is_celsius(tmp_path, kind, packed):
     values, path = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]]), tmp_path / "a.tiff"
-    strip, order, bits = values.astype(kind).tobytes(), kind[0], 8 * int(kind[2])
-    strip = zlib.compress(strip) if packed else strip
-    tags = {256: 3, 257: 2, 258: bits, 259: 8 if packed else 1, 262: 1, 273: 0, 277: 1, 278: 2, 279: len(strip), 339: 3}
-    tags[273] = 8 + 2 + 12 * len(tags) + 4
+    strip, order = (zlib.compress if packed else bytes)(values.astype(kind).tobytes()), kind[0]
+    tags = {256: 3, 257: 2, 258: 8 * int(kind[2]), 259: 8 if packed else 1, 262: 1, 273: 134, 277: 1, 278: 2, 339: 3}
+    tags = dict(sorted((tags | {279: len(strip)}).items()))  # the strip begins behind 8 + 2 + 12 * 10 + 4 bytes
     entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags.items())
     head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
     path.write_bytes(head + entries + bytes(4) + strip)
