@@ -12,6 +12,7 @@ Every figure is a median; ratios are against the reference in the same run: plai
 which skips what is empty. Where there is a CUDA device, the same state goes on there, by the reference.
 """
 
+import math
 import statistics
 import tempfile
 import time
@@ -115,7 +116,7 @@ class StepSpeed:
                 shown = there.pipeline.model.get_outputs_for_camera
                 figures["cuda_view"] = self.median(lambda: (shown(on_gpu), torch.cuda.synchronize()))
         voxels = model.grid.voxels
-        return {"resolution": resolution, "kept": len(voxels) / voxels.mask().size, **figures}
+        return {"resolution": resolution, "kept": len(voxels) / math.prod(voxels.lattice.cell_shape), **figures}
 
     def median(self, work: Callable[[], object]) -> float:
         """Median time of one call, after one that does not count."""

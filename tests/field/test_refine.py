@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.reference import two_renderers
+from tests.support.small_fields import kept_mask
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.refine import prune, refine, split_voxels, widen_colour
@@ -67,11 +68,11 @@ def test_old_corners_keep_their_values_to_the_last_bit(factor, kept):
 @pytest.mark.parametrize("factor", [2, 3, 4])
 def test_split_voxels_are_those_of_the_dense_mask(factor):
     voxels = random_grid(kept=0.3).voxels
-    expected = voxels.mask()
+    expected = kept_mask(voxels).numpy()
     for axis in range(3):
         expected = expected.repeat(factor, axis)
     fine = split_voxels(voxels, factor)
-    np.testing.assert_array_equal(fine.mask(), expected)
+    np.testing.assert_array_equal(kept_mask(fine), expected)
     assert fine.lattice == voxels.lattice.refined(factor) and bool((np.diff(fine.cells) > 0).all())
 
 
@@ -98,22 +99,22 @@ def test_pruning_nothing_and_everything():
     grid = random_grid()
     before = grid.density.detach().clone()
     prune(grid, np.ones(len(grid.voxels), dtype=bool))
-    assert torch.equal(grid.density, before) and grid.voxels.all_kept
+    assert torch.equal(grid.density, before) and len(grid.voxels) == np.prod(grid.lattice.cell_shape)
     prune(grid, np.zeros(len(grid.voxels), dtype=bool))
-    assert len(grid.voxels) == 0 and grid.density.shape == (0, 1) and not bool(grid.kept.any())
+    assert len(grid.voxels) == 0 and grid.density.shape == (0, 1)
     assert float(grid.voxel_density().abs().max()) == 0.0
 
 
 def test_dense_views_are_nil_where_nothing_is_kept():
     grid = random_grid("relu", kept=0.3)
-    corners, centres = grid.corner_density(), grid.voxel_density()
+    corners, centres, kept = grid.corner_density(), grid.voxel_density(), kept_mask(grid.voxels)
     stored = torch.zeros(grid.lattice.num_corners, dtype=torch.bool)
     stored[torch.from_numpy(grid.voxels.corners)] = True
     assert float(corners.view(-1)[~stored].abs().max()) == 0.0 and int((~stored).sum()) > 0
     torch.testing.assert_close(corners.view(-1)[stored], grid.density.data[:, 0].clamp(min=0))
-    assert float(centres[~grid.kept].abs().max()) == 0.0
-    middle = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[grid.kept]
-    torch.testing.assert_close(centres[grid.kept], grid.density_at(grid.locate(middle)).detach(), rtol=1e-5, atol=1e-6)
+    assert float(centres[~kept].abs().max()) == 0.0
+    middle = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[kept]
+    torch.testing.assert_close(centres[kept], grid.density_at(grid.locate(middle)).detach(), rtol=1e-5, atol=1e-6)
     assert float(grid.corner_values(grid.density.data[:, 0], fill=0.5).view(-1)[~stored].min()) == 0.5
 
 
@@ -130,7 +131,7 @@ def places_of(low: int, high: int) -> torch.Tensor:
 def test_colours_stay_and_new_columns_are_nil(low, high):
     grid = two_renderers.random_grid(low, kept=0.5)
     before, old = grid.sh.detach().clone(), grid.sh
-    points = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[grid.kept]
+    points = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[kept_mask(grid.voxels)]
     directions = torch.nn.functional.normalize(torch.randn(len(points), 3), dim=-1)
     colours = grid.rgb_at(grid.locate(points), directions).detach()
     change = widen_colour(grid, high)

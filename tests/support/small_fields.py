@@ -7,16 +7,25 @@ from itertools import permutations
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 
 from tests.support.heat_bodies import mesh_from
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
+
+
+def kept_mask(voxels: KeptVoxels) -> torch.Tensor:
+    """True for kept voxels, in the shape of the lattice's cells."""
+    kept = torch.zeros(voxels.lattice.cell_shape, dtype=torch.bool)
+    kept.view(-1)[torch.from_numpy(voxels.cells)] = True
+    return kept
 
 
 @pytest.fixture

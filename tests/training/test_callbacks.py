@@ -11,6 +11,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from tests.support.short_training import rays_along_minus_x
+from tests.support.small_fields import kept_mask
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.snapshot import Views
@@ -55,7 +56,7 @@ def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
     model = model_of()
     old = model.grid.voxels
     said, change = prune_by_rays(model, Rays(), 0.01, dilation)
-    kept = model.grid.kept
+    kept = kept_mask(model.grid.voxels)
     assert [x for x in range(8) if bool(kept[x].any())] == layers and bool(kept[layers].all())
     assert len(model.grid.voxels) == 64 * len(layers)
     assert change(torch.arange(old.num_rows)[:, None].float()).shape == (model.grid.voxels.num_rows, 1)
@@ -66,8 +67,8 @@ def test_no_hole_opens_where_no_ray_was_drawn():
     """One ray in four of a fine surface: the voxels between are opaque, and stay."""
     model = model_of(resolutions=(16,))
     prune_by_rays(model, Rays(torch.arange(-0.9375, 1.0, 0.25)), 0.01, 0)
-    first = int(model.grid.kept.any(-1).any(-1).nonzero().max())
-    assert bool(model.grid.kept[first - 1].all()), "the first layer that is solid throughout"
+    first = int(kept_mask(model.grid.voxels).any(-1).any(-1).nonzero().max())
+    assert bool(kept_mask(model.grid.voxels)[first - 1].all()), "the first layer that is solid throughout"
 
 
 def fog(model: ThermoxelsModel, density: float) -> None:
@@ -81,7 +82,7 @@ def test_a_threshold_that_would_open_rays_is_lowered():
     model = model_of()
     fog(model, 1.5)
     assert "threshold 0.075" in prune_by_rays(model, Rays(), 0.3, 0)[0]
-    kept = model.grid.kept
+    kept = kept_mask(model.grid.voxels)
     assert bool(kept[7, 5:].all()) and not bool(kept[7, :3].any()) and bool(kept[2, :4].all())
 
 
@@ -94,7 +95,7 @@ def test_pruning_that_would_remove_a_part_of_the_scene_fails_and_changes_nothing
         PruningError, match=r"open at most 1% of the rays.* got 4\d\.\d% .*--pipeline.model.prune-threshold"
     ):
         prune_by_rays(model, Rays(), 0.99, 0)
-    assert model.grid.voxels.all_kept and model.grid.density is before
+    assert len(model.grid.voxels) == 32**3 and model.grid.density is before
 
 
 def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes:
@@ -170,7 +171,7 @@ def test_air_is_carved_at_the_start_and_after_a_refinement(carve):
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_threshold=0.0, carve=carve)
     model.feature_rays = lines
     for _ in steps_of(model, attributes(model, 10), 4):
-        kept, empty = model.grid.kept.numpy(), air_voxels(model.grid.lattice, lines)
+        kept, empty = kept_mask(model.grid.voxels).numpy(), air_voxels(model.grid.lattice, lines)
         assert kept.all() if carve == "off" else empty.any() and not (kept & empty).any()
 
 
@@ -186,7 +187,7 @@ def test_voxels_that_fewer_than_two_photographs_show_go(narrow):
     centres = model.grid.lattice.cell_centres()
     beside = np.abs(centres[..., 1:]).max(axis=-1) > 0.25 * (3.0 - centres[..., 0])
     assert beside.any() and not beside.all()
-    assert torch.equal(model.grid.kept, torch.from_numpy(~beside if narrow else np.ones_like(beside)))
+    assert torch.equal(kept_mask(model.grid.voxels), torch.from_numpy(~beside if narrow else np.ones_like(beside)))
 
 
 def test_where_no_two_photographs_show_anything_of_the_box_air_goes_all_the_same():
@@ -198,7 +199,7 @@ def test_where_no_two_photographs_show_anything_of_the_box_air_goes_all_the_same
     given.pipeline.datamanager.views.camera_to_world[:, :, [0, 2]] *= -1.0
     next(steps_of(model, given, 1))
     air = torch.from_numpy(air_voxels(model.grid.lattice, model.feature_rays))
-    assert bool(air.any()) and torch.equal(model.grid.kept, ~air)
+    assert bool(air.any()) and torch.equal(kept_mask(model.grid.voxels), ~air)
 
 
 @pytest.mark.parametrize("voxel_pixels", [0.0, 1.6])
@@ -211,7 +212,7 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
         assert [*steps_of(model, given, 3)][-1] == 2
     assert model.config.resolutions == ((8,) if voxel_pixels else (8, 32))
     assert given.trainer.saved == ([(8,)] if voxel_pixels else []), "what is resumed knows it"
-    assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept
+    assert model.grid.lattice.cell_shape == (8, 8, 8) and len(model.grid.voxels) == 8**3
 
 
 def test_progress_is_told_at_each_twentieth_and_after_a_silence(monkeypatch, capsys):

@@ -9,6 +9,7 @@ import torch
 from torch.utils._pytree import tree_map
 
 from tests.support.short_training import Training
+from tests.support.small_fields import kept_mask
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 DEVICE = torch.device("cuda", 0)
@@ -196,7 +197,7 @@ def test_a_gpu_trains_as_the_cpu_does(device, scene):
         same = here.keys() if step < COURSE["refine_at"][0] else here.keys() & {"rgb_loss", "thermal_loss"}
         for name in same:
             assert there[name] == pytest.approx(here[name], rel=5e-4 if step < 2 else 0.05, abs=1e-5), (step, name)
-    kept, of_cpu = (run.pipeline.model.grid.kept for run in (training, on_cpu))
+    kept, of_cpu = (kept_mask(run.pipeline.model.grid.voxels) for run in (training, on_cpu))
     assert float((kept == of_cpu).float().mean()) > 0.98
     for name, image in image_of(on_cpu, "cpu").items():
         torch.testing.assert_close(seen[name], image, atol=5e-3, rtol=5e-3)

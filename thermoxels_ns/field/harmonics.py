@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,15 +23,6 @@ def num_coefficients(degree: int) -> int:
     """
     assert 0 <= degree <= MAX_DEGREE
     return (degree + 1) ** 2
-
-
-def degree_of(coefficients: int) -> int:
-    """Return the highest degree of a set of `coefficients` harmonics; the inverse of `num_coefficients`.
-
-    >>> degree_of(9)
-    2
-    """
-    return math.isqrt(coefficients) - 1
 
 
 def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:

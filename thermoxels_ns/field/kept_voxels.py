@@ -40,9 +40,8 @@ class KeptVoxels:
 
     def __init__(self, lattice: Lattice, cells: npt.ArrayLike | None = None):
         self.lattice = lattice
-        total = int(np.prod(lattice.cell_shape))
-        self.cells: IntArray = np.arange(total) if cells is None else np.ascontiguousarray(cells, dtype=np.int64)
-        self.all_kept = len(self.cells) == total
+        chosen = np.arange(np.prod(lattice.cell_shape)) if cells is None else cells
+        self.cells: IntArray = np.ascontiguousarray(chosen, dtype=np.int64)
         place = np.unravel_index(self.cells, lattice.cell_shape)
         first = np.ravel_multi_index(place, lattice.shape)
         _, cy, cz = lattice.shape
@@ -74,12 +73,6 @@ class KeptVoxels:
 
     def __len__(self) -> int:
         return len(self.cells)
-
-    def mask(self) -> BoolArray:
-        """Return which voxels of the lattice are kept, boolean, shape `lattice.cell_shape`."""
-        kept = np.zeros(self.lattice.cell_shape, dtype=bool)
-        kept.reshape(-1)[self.cells] = True
-        return kept
 
     def corner_index(self) -> IntArray:
         """Return the lattice index (i, j, k) of the corner of each row, shape (rows, 3)."""

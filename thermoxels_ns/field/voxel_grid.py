@@ -6,11 +6,11 @@ from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.harmonics import MAX_DEGREE, degree_of, harmonics, harmonics_with_unit_mean, num_coefficients
+from thermoxels_ns.field.harmonics import MAX_DEGREE, harmonics, harmonics_with_unit_mean, num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
@@ -90,17 +90,12 @@ class VoxelGrid(nn.Module):
     @property
     def sh_degree(self) -> int | None:
         """Degree of the colour harmonics that are stored; None without colour."""
-        return None if self.sh is None else degree_of(self.sh.shape[1] // 3)
+        return None if self.sh is None else COLOUR_CHANNELS.index(self.sh.shape[1])
 
     @property
     def lattice(self) -> Lattice:
         """The whole lattice, including corners that no kept voxel uses."""
         return self.voxels.lattice
-
-    @property
-    def kept(self) -> Bool[Tensor, "x y z"]:
-        """Mask of the lattice's voxels on the CPU, True for kept voxels."""
-        return torch.from_numpy(self.voxels.mask())
 
     def row_parameters(self) -> dict[str, nn.Parameter]:
         """Return the parameters by name: density, sh (with colour only) and temperature, each (rows, columns)."""
