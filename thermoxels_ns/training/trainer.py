@@ -255,29 +255,19 @@ class ThermoxelsTrainer(Trainer):
             CONSOLE.log(f"goes on from step {first} for {steps} more{end}")
 
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint to a temporary file, rename the file, and only then delete older checkpoints.
+        """Write a checkpoint into a temporary folder, rename the file, and only then delete older checkpoints.
 
-        The temporary file lies outside the checkpoint folder, where nerfstudio takes each file for a checkpoint.
-        Raises `OutputError` if the file cannot be written.
+        The folder lies outside the checkpoint folder, where nerfstudio takes each file for a checkpoint. Raises
+        `OutputError` if the file cannot be written.
         """
         if self.local_rank != 0:
             return
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         final = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        unfinished = self.checkpoint_dir.parent / f".{final.name}.part"
-        pipeline = getattr(self.pipeline, "module", self.pipeline)
+        self.checkpoint_dir = unfinished = final.parent.parent / f".{final.stem}.part"
         try:
-            torch.save(
-                {
-                    "step": step,
-                    "pipeline": pipeline.state_dict(),
-                    "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
-                    "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
-                    "scalers": self.grad_scaler.state_dict(),
-                },
-                unfinished,
-            )
-            os.replace(unfinished, final)
+            super().save_checkpoint(step)
+            os.replace(unfinished / final.name, final)
         except (OSError, RuntimeError) as problem:
             free = shutil.disk_usage(final.parent).free
             got = f"{type(problem).__name__} with {free / 1e6:.3g} MB of free space"
@@ -286,7 +276,8 @@ class ThermoxelsTrainer(Trainer):
                 remedy = f"Free space, then go on from the one before it: --load-dir {shlex.quote(str(final.parent))}"
             raise OutputError(f"checkpoint {final}", expected="room for it", got=got, remedy=remedy) from problem
         finally:
-            unfinished.unlink(missing_ok=True)
+            self.checkpoint_dir = final.parent
+            shutil.rmtree(unfinished, ignore_errors=True)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != final:
