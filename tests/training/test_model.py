@@ -274,7 +274,7 @@ def test_other_sizes_of_the_world_are_converted():
         bundle = rays()
         bundle.origins = bundle.origins * size
         outputs = model(bundle)
-        results.append((outputs["accumulation"], model.get_loss_dict(outputs, targets())["distortion_loss"]))
+        results.append((outputs["render"].box.accumulation, model.get_loss_dict(outputs, targets())["distortion_loss"]))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(results[0][1], results[1][1], rtol=1e-3, atol=1e-9)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import cv2
 import numpy as np
 import torch
@@ -147,11 +145,6 @@ def thermal_metrics(
         "thermal_mae_roi_c": float(error_k[hot_region(target, valid)].abs().mean()),
         "thermal_mae_debiased_c": float((error_k - error_k[valid].mean())[valid].abs().mean()),
     }
-
-
-def lpips_available() -> bool:
-    """Return whether the optional package for LPIPS is installed (`pip install thermoxels-ns[lpips]`)."""
-    return importlib.util.find_spec("lpips") is not None
 
 
 def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:

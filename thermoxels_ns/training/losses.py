@@ -20,11 +20,6 @@ reaches beyond the surface in it and hides things beside that surface. No light 
 motion: these are fewer, and rooms would keep more floaters."""
 
 
-def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Return the mean squared error of colour (paper, eq. 3)."""
-    return torch.mean((predicted - target) ** 2)
-
-
 def thermal_loss(predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"]) -> Float[Tensor, ""]:
     """Return half of the mean squared plus half of the mean absolute error (paper, eq. 4 with lambda = 1/2)."""
     error = predicted - target

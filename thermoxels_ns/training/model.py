@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,6 @@ from thermoxels_ns.training.image_metrics import (
     SATURATED,
     fitted_gain,
     lpips,
-    lpips_available,
     psnr,
     psnr_of_blocks,
     ssim,
@@ -256,11 +256,7 @@ class ThermoxelsModel(Model):
         if self.thermal_offset is not None and offsets_on:
             offset = self._correction(self.thermal_offset, self.config.per_image_offset)
             thermal = thermal + (offset - offset.mean()).index_select(0, photograph)[:, None]
-        accumulation = seen.box.accumulation[:, None]
-        return batch | {
-            **{"rgb": rgb, "thermal": thermal, "accumulation": accumulation},
-            **{"render": seen, "known_rays": terms},
-        }
+        return batch | {"rgb": rgb, "thermal": thermal, "render": seen, "known_rays": terms}
 
     def _correction(self, correction: Tensor, wanted: str) -> Tensor:
         """Return `correction`, detached if its option `wanted` is auto and the distortion ramp has not ended yet."""
@@ -296,7 +292,7 @@ class ThermoxelsModel(Model):
             seen, measured = pair
             if self.training and bool(self.corrected[0]):  # a saturated pixel may have been brighter than it says
                 seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
-            terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
+            terms["rgb_loss"] = weights.rgb * torch.mean((seen - measured) ** 2)
         if weights.thermal and (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
             terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair)
         if not self.training:
@@ -382,7 +378,7 @@ class ThermoxelsModel(Model):
             metrics["psnr_8"] = psnr_of_blocks(predicted, target, mask)
             in_box = outputs["in_box"] > 0 if mask is None else (outputs["in_box"] > 0) & mask
             metrics["psnr_box"] = psnr(predicted, target, in_box.expand_as(target))
-            if lpips_available():
+            if find_spec("lpips") is not None:  # an optional package: pip install thermoxels-ns[lpips]
                 metrics["lpips"] = lpips(predicted, target)
             images["img"] = torch.cat((target, predicted), dim=1)
         seen = outputs
