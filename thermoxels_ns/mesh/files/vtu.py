@@ -427,14 +427,10 @@ def _numbered(values: npt.NDArray, names: tuple[str, ...]) -> tuple[IntArray, tu
 
 def _names(body: Any, name: str) -> tuple[str, ...]:
     """Return the names of the regions in the order of their numbers, read from field arrays `region:NAME`."""
-    arrays = body.GetFieldData()
-    numbers = {}
-    for place in range(arrays.GetNumberOfArrays()):
-        array = arrays.GetAbstractArray(place)
-        if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
-            numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
-    if sorted(numbers) != list(range(1, len(numbers) + 1)) or not numbers:
-        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 1", sorted(numbers) or "none")
+    arrays = {key.removeprefix(_REGION): one for key, one in body.field_data.items() if key.startswith(_REGION)}
+    numbers = {one.item(): key for key, one in arrays.items() if np.size(one) == 1}
+    if set(numbers) != set(range(1, len(numbers) + 1)) or not numbers:
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 1", [*numbers] or "none")
     return tuple(numbers[number] for number in range(1, len(numbers) + 1))
 
 
@@ -455,11 +451,8 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, In
         raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
     facet_tags = np.where(array("on_box") != 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
-    names = surface.GetFieldData().GetAbstractArray("patch_names")
-    if names is None:
-        raise _wrong(name, "the field array patch_names", "none")
-    every = tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues()))
-    patch, patch_names = _numbered(array("patch"), every)
+    every = _array(surface.field_data, "patch_names", name).ravel()
+    patch, patch_names = _numbered(array("patch"), tuple(map(str, every.tolist())))
     counts = [f"photographs_{what}" for what in ("seen", "supporting")]
     counted = any(count in surface.cell_data for count in counts)
     return (
