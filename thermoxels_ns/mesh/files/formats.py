@@ -82,7 +82,7 @@ def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0
         {".xdmf": write_xdmf, ".msh": write_msh, ".inp": write_inp}[path.suffix](path, mesh)
 
 
-def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
+def write_glb(path: Path, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
     """Write the boundary as binary glTF 2.0, in metres, with a colour per node.
 
     Colours show temperatures. A mesh without temperatures gets the colours of the photographs, or else grey. Colours
@@ -95,8 +95,6 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
-    path = Path(path)
-    mesh.check()
     x, y, z = check_direction("up", up, "Pass for instance (0, 0, 1).", MeshError).tolist()
     nodes, triangles = nodes_and_triangles(mesh.facets)
     points, temperature_c = mesh.points_m[nodes], mesh.temperature_c[nodes]
@@ -141,7 +139,7 @@ def _finish(tree: dict[str, Any]) -> None:
     tree["asset"]["generator"] = "thermoxels"
 
 
-def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
+def write_xdmf(path: Path, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell; the grid "facets" holds the boundary triangles with
@@ -159,8 +157,6 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """
     import h5py
 
-    path = Path(path)
-    mesh.check()
     tags = mesh.boundary
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,
@@ -216,7 +212,7 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
     return f"{start}{body}\n{boundary}\n</Domain>\n</Xdmf>\n"
 
 
-def write_msh(path: Path | str, mesh: TetMesh) -> None:
+def write_msh(path: Path, mesh: TetMesh) -> None:
     """Write a mesh as a Gmsh file, MSH 2.2, binary, with one physical group per region and per patch.
 
     Regions become physical volumes and patches physical surfaces, numbered from 1; empty regions and patches are left
@@ -224,8 +220,6 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     k + 1; boundary triangles get the numbers after the tetrahedra. Layout: "MSH file format version 2", Gmsh reference
     manual; it does not group nodes as version 4 does. meshio cannot write a patch that has the name of a region.
     """
-    path = Path(path)
-    mesh.check()
     tags = mesh.boundary
     names = [f'2 {number + 1} "{tags.patch_names[number]}"' for number in np.unique(tags.patch).tolist()]
     names += [f'3 {number + 1} "{mesh.region_names[number]}"' for number in np.unique(mesh.region).tolist()]
@@ -262,7 +256,7 @@ def _elements(kind: int, first: int, cells: IntArray, group: IntArray) -> bytes:
     return np.array([kind, len(cells), 2], _INT).tobytes() + _numbered(first, ("row", _INT, rows.shape[1]), rows)
 
 
-def write_inp(path: Path | str, mesh: TetMesh, *, steps: int = 10, step_seconds: float = 60.0) -> None:
+def write_inp(path: Path, mesh: TetMesh, *, steps: int = 10, step_seconds: float = 60.0) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
     Units are metres, kilograms, seconds and degrees Celsius; node k and tetrahedron k get the number k + 1. Contents:
@@ -276,8 +270,6 @@ def write_inp(path: Path | str, mesh: TetMesh, *, steps: int = 10, step_seconds:
     Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
     and patches are left out, because an empty set stops a solver. Raises `MeshError` if the mesh has no temperatures.
     """
-    path = Path(path)
-    mesh.check()
     tags = mesh.boundary
     check_start(mesh)
     regions = _set_names("region_names", mesh.region_names)
