@@ -64,7 +64,7 @@ def test_huge_density_is_opaque_with_finite_gradients(renderer, sigma):
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("activation", ["relu", "softplus", "exp"])
+@pytest.mark.parametrize("activation", ["relu", "exp"])
 def test_nan_density_is_refused_not_made_transparent(renderer, activation):
     grid = random_grid(0, 0, activation, 1.0, CUBE)
     grid.density.data[len(grid.density) // 2] = float("nan")
@@ -287,7 +287,7 @@ def test_renders_are_the_sums_of_the_paper():
             assert float(seen.depth[r]) == pytest.approx(distance / (1.0 - left), rel=1e-9)
 
 
-@pytest.mark.parametrize("activation", ["relu", "softplus", "exp"])
+@pytest.mark.parametrize("activation", ["relu", "exp"])
 def test_activations_stay_finite_for_any_stored_value(activation):
     grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (2, 2, 2)), sh_degree=None, activation=activation)
     for value in (-1e30, -100.0, 0.0, 100.0, 1e30):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import math
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +15,7 @@ from thermoxels_ns.field.harmonics import MAX_DEGREE, harmonics, harmonics_with_
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
-DensityActivation = Literal["relu", "softplus", "exp"]
+DensityActivation = Literal["relu", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
 """Numbers of columns that the colour of a corner has, for each degree of its harmonics."""
 
@@ -24,24 +25,10 @@ _PALEST = 0.02  # `VoxelGrid.paint` clips colours to 0.02 .. 0.98, because a sig
 def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
     """Return the density, >= 0, [1 / world unit], of interpolated raw density.
 
-    `relu` is the choice of Plenoxels and of the paper. `softplus` (DVGO, Sun et al. 2022) and `exp` (Instant-NGP) let
-    one voxel hold a sharp surface; `exp` is limited to e^15, which is opaque at any resolution.
+    `relu` is the choice of Plenoxels and of the paper. `exp` (Instant-NGP) lets one voxel hold a sharp surface; it is
+    limited to e^15, which is opaque at any resolution.
     """
-    if kind == "relu":
-        return F.relu(raw)
-    if kind == "softplus":
-        return F.softplus(raw)
-    return torch.exp(raw.clamp(max=15.0))
-
-
-def raw_density(density: float, kind: DensityActivation) -> float:
-    """Return the raw density that `activate_density` maps to `density`, which must be above 0, [1 / world unit].
-
-    >>> round(raw_density(0.1, "softplus"), 4)
-    -2.2522
-    """
-    value = torch.tensor(density, dtype=torch.float64)
-    return float({"relu": value, "softplus": torch.log(torch.expm1(value)), "exp": torch.log(value)}[kind])
+    return F.relu(raw) if kind == "relu" else torch.exp(raw.clamp(max=15.0))
 
 
 class VoxelGrid(nn.Module):
@@ -77,13 +64,14 @@ class VoxelGrid(nn.Module):
         self.activation: DensityActivation = activation
         self.voxels = KeptVoxels(lattice)
         n = lattice.num_corners
-        self.density = nn.Parameter(torch.full((n, 1), raw_density(start_density, activation)))
+        raw = start_density if activation == "relu" else math.log(start_density)
+        self.density = nn.Parameter(torch.full((n, 1), raw))
         channels = 0 if sh_degree is None else 3 * num_coefficients(sh_degree)
         self.sh = nn.Parameter(torch.zeros(n, channels)) if channels else None
         temperature = torch.zeros(n, num_coefficients(temperature_degree))
         temperature[:, 0] = 0.5
         self.temperature = nn.Parameter(temperature)
-        self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
+        self.register_buffer("activation_index", torch.tensor({"relu": 0, "exp": 2}[activation]))  # as in old runs
         for name, values in _described(self.voxels).items():
             self.register_buffer(name, values)
 

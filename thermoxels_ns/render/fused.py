@@ -22,7 +22,7 @@ from thermoxels_ns.render.kernels_backward import Blocks, Order, RayGradients, R
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
-ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
+ACTIVATIONS = {"relu": kernels.RELU, "exp": kernels.EXP}
 VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation one task sums
 FEWEST_SAMPLES = 24  # Mean number of samples per ray for which the first batch allocates memory
 MOST_GROUPS = 1 << 12  # Most groups of voxels by which samples are sorted (one group more may occur)

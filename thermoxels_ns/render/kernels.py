@@ -18,7 +18,7 @@ BLOCK = 8  # Voxels along the side of a block of `KeptVoxels`
 OPAQUE = 100.0  # Largest optical depth of a step; light behind such a step is 0
 EXP_LIMIT = 15.0  # Raw density above which the activation `exp` stays constant
 AHEAD = 8  # Samples of a ray that `march_rays` finds and reads before it weighs them
-RELU, SOFTPLUS, EXP = 0, 1, 2
+RELU, EXP = 0, 1
 DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
 """Bits of `SampleGradients.uses`: the parameters for which a sample has a gradient."""
 
@@ -36,7 +36,7 @@ class Volume(NamedTuple):
     density: Floats  # Raw density, before the activation, (rows, 1)
     sh: Floats  # k harmonics of red, of green and of blue, (rows, 3 k); (0, 0) without colour
     temperature: Floats  # k harmonics of normalised temperature, (rows, k)
-    activation: int  # RELU, SOFTPLUS or EXP
+    activation: int  # RELU or EXP
 
 
 class Rays(NamedTuple):
@@ -230,8 +230,6 @@ def activate(raw: float, kind: int):
     """Return the density of an interpolated raw density, for the activation `kind`; NaN for NaN."""
     if kind == RELU:
         return raw if not raw <= 0.0 else 0.0
-    if kind == SOFTPLUS:
-        return raw if raw > 20.0 else math.log1p(math.exp(raw))
     return math.exp(raw if not raw > EXP_LIMIT else EXP_LIMIT)
 
 

@@ -14,7 +14,6 @@ from thermoxels_ns.render.kernels import (
     EXP_LIMIT,
     OPAQUE,
     RELU,
-    SOFTPLUS,
     TEMPERATURE,
     Y00,
     Floats,
@@ -119,8 +118,6 @@ def find_sample_gradients(
             slope = slope * delta if density * delta < OPAQUE else 0.0
             if volume.activation == RELU:
                 slope = slope if density > 0.0 else 0.0
-            elif volume.activation == SOFTPLUS:
-                slope *= -math.expm1(-density)
             else:
                 slope = slope * density if density < _FLAT_EXP else 0.0
             samples.raw_density[n] = slope

@@ -106,7 +106,7 @@ class ThermoxelsModelConfig(ModelConfig):
     temperature_degree: int = 0
     """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""
     density_activation: DensityActivation = "exp"
-    """Maps interpolated values to density: relu is the paper's; exp and softplus hold a sharp surface in one voxel."""
+    """Maps interpolated values to density: relu is the paper's; exp holds a sharp surface in one voxel."""
     start_density: float = 0.1
     """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
     carve: Literal["auto", "off"] = "auto"
