@@ -150,8 +150,7 @@ def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
     >>> facing(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0.6, -0.8]]), up=(0, 0, 2)).tolist()
     [0, 1, 2]
     """
-    direction = check_direction("up", up, "Pass the direction away from the ground.", MeshError)
-    cosine = np.asarray(normals) @ (direction / float(np.linalg.norm(direction)))
+    cosine = np.asarray(normals) @ check_direction("up", up, "Pass the direction away from the ground.", MeshError)
     return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
 
 

@@ -166,7 +166,4 @@ def _goals(
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
     """Return for each of `count` nodes the sum, (count,), of `values` (f,) over the triangles `facets` around it."""
-    total = np.zeros(count)
-    for column in facets.T:
-        total += np.bincount(column, values, count)
-    return total
+    return np.bincount(facets.ravel(), np.repeat(values, 3), count)
