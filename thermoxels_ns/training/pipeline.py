@@ -25,7 +25,6 @@ from thermoxels_ns.render.renderers import choose_backend
 from thermoxels_ns.training.model import ThermoxelsModel
 
 _GRID = "_model.grid."
-_ACTIVATION = f"{_GRID}activation_index"
 
 
 @dataclass
@@ -118,11 +117,8 @@ class ThermoxelsPipeline(VanillaPipeline):
             expected = f"one of the resolutions {self.model.config.resolutions}"
             remedy = "Pass --pipeline.model.resolutions as in training; finer ones may follow."
             raise CheckpointError("checkpoint", expected=expected, got=f"{resolution} voxels", remedy=remedy)
-        if not torch.equal(own[_ACTIVATION].cpu(), state[_ACTIVATION].cpu()):
-            remedy = "Use the option as in training."
-            got = self.model.config.density_activation
-            raise CheckpointError("density_activation", expected="the checkpoint's", got=got, remedy=remedy)
         for name, what, tolerance in (
+            (f"{_GRID}activation_index", "density_activation", 0.0),
             ("world_from_input", "poses and scene box", 1e-4),
             ("_model.temperature_bounds_c", "temperature range", 1e-3),
             ("_model.thermal_offset", "number of training images", math.inf),
@@ -131,9 +127,9 @@ class ThermoxelsPipeline(VanillaPipeline):
                 continue
             here, stored = own[name].cpu().double(), state[name].cpu().double()
             if here.shape != stored.shape or not torch.allclose(here, stored, atol=tolerance, rtol=1e-4):
-                remedy = "Use the scene folder and the dataparser options of the training run."
-                got = "others from the scene"
-                raise CheckpointError(what, expected="those the checkpoint was trained with", got=got, remedy=remedy)
+                remedy = "Use the scene folder and the options of the training run."
+                expected = "what the checkpoint was trained with"
+                raise CheckpointError(what, expected=expected, got="something else", remedy=remedy)
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
