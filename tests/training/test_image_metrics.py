@@ -11,26 +11,31 @@ from thermoxels_ns.training import image_metrics as metrics
 def images(h=48, w=64):
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(h, w, 1, generator=generator)
-    return target, torch.ones(h, w, 1, dtype=torch.bool), torch.ones(h, w, 1)
+    return target, torch.ones(h, w, 1, dtype=torch.bool)
+
+
+def thermal_metrics(predicted, target, valid, span_k, opacity=1.0):
+    seen = {"thermal": predicted, "accumulation": opacity * torch.ones_like(target), "in_box": torch.ones_like(target)}
+    return metrics.thermal_metrics(seen, target, valid, span_k)
 
 
 def test_constant_shift_is_an_error_in_degrees_that_debiasing_removes():
-    target, valid, opaque = images()
-    result = metrics.thermal_metrics(target, target, valid, opaque, opaque > 0, span_k=40.0)
+    target, valid = images()
+    result = thermal_metrics(target, target, valid, 40.0)
     assert result["thermal_ssim"] == pytest.approx(1.0) and result["thermal_hssim"] == pytest.approx(1.0)
     assert all(result[f"thermal_mae_{k}"] == 0.0 for k in ("c", "hit_c", "roi_c", "debiased_c"))
-    result = metrics.thermal_metrics(target + 0.05, target, valid, opaque, opaque > 0, span_k=40.0)
+    result = thermal_metrics(target + 0.05, target, valid, 40.0)
     assert result["thermal_mae_c"] == pytest.approx(2.0, rel=1e-5)
     assert result["thermal_mae_debiased_c"] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_only_valid_and_hit_pixels_count():
-    target, valid, opaque = images()
-    predicted = target.clone()
+    target, valid = images()
+    predicted, opacity = target.clone(), torch.ones_like(target)
     predicted[:10] += 0.5  # wrong where nothing was measured
     predicted[10:20] += 0.1  # wrong where nothing was hit
-    valid[:10], opaque[10:20] = False, 0.2
-    result = metrics.thermal_metrics(predicted, target, valid, opaque, opaque > 0, span_k=10.0)
+    valid[:10], opacity[10:20] = False, 0.2
+    result = thermal_metrics(predicted, target, valid, 10.0, opacity)
     assert result["thermal_mae_hit_c"] == 0.0
     assert result["thermal_mae_c"] == pytest.approx(10 / 38, rel=1e-5)
 
@@ -45,10 +50,10 @@ def test_hot_region_is_the_hot_side():
 
 def test_flat_images_and_images_without_a_valid_pixel_give_no_nan_where_a_number_exists():
     flat = torch.full((16, 16, 1), 0.5)
-    every, opaque = torch.ones_like(flat, dtype=torch.bool), torch.ones_like(flat)
-    result = metrics.thermal_metrics(flat, flat, every, opaque, opaque > 0, 1.0)
+    every = torch.ones_like(flat, dtype=torch.bool)
+    result = thermal_metrics(flat, flat, every, 1.0)
     assert result["thermal_hssim"] == pytest.approx(1.0) and all(map(math.isfinite, result.values()))
-    nothing = metrics.thermal_metrics(flat, flat, ~every, opaque, opaque > 0, 1.0)
+    nothing = thermal_metrics(flat, flat, ~every, 1.0)
     assert math.isnan(nothing["thermal_mae_c"]) and math.isnan(nothing["thermal_psnr"])
 
 
@@ -108,9 +113,8 @@ def test_invalid_pixels_do_not_flatter_the_structure():
     a, b = (torch.rand(64, 64, 1, generator=generator) for _ in range(2))
     valid = torch.zeros(64, 64, 1, dtype=torch.bool)
     valid[:32, :32] = True
-    opaque = torch.ones(64, 64, 1)
-    masked = metrics.thermal_metrics(a, b, valid, opaque, opaque > 0, 1.0)
-    whole = metrics.thermal_metrics(a, b, torch.ones_like(valid), opaque, opaque > 0, 1.0)
+    masked = thermal_metrics(a, b, valid, 1.0)
+    whole = thermal_metrics(a, b, torch.ones_like(valid), 1.0)
     assert masked["thermal_ssim"] < 0.2 and abs(masked["thermal_ssim"] - whole["thermal_ssim"]) < 0.1
     assert abs(masked["thermal_hssim"] - whole["thermal_hssim"]) < 0.15
-    assert math.isnan(metrics.thermal_metrics(a, b, ~torch.ones_like(valid), opaque, opaque > 0, 1.0)["thermal_ssim"])
+    assert math.isnan(thermal_metrics(a, b, ~torch.ones_like(valid), 1.0)["thermal_ssim"])

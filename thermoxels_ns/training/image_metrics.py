@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 import torch
@@ -109,21 +111,14 @@ def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1
 
 
 def thermal_metrics(
-    predicted: Float[Tensor, "h w 1"],
-    target: Float[Tensor, "h w 1"],
-    valid: Bool[Tensor, "h w 1"],
-    accumulation: Float[Tensor, "h w 1"],
-    in_box: Bool[Tensor, "h w 1"],
-    span_k: float,
+    seen: Mapping[str, Tensor], target: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"], span_k: float
 ) -> dict[str, float]:
     """Return all thermal metrics of one image.
 
     Args:
-        predicted: Rendered normalised temperature.
+        seen: `thermal`, `accumulation` and `in_box` of the rendered image, (h, w, 1) each, as the model returns them.
         target: Measured normalised temperature.
         valid: Pixels that were measured.
-        accumulation: Opacity of the rendered rays.
-        in_box: Pixels whose rays meet the scene box.
         span_k: Width of the temperature range, [K].
 
     Returns:
@@ -132,6 +127,7 @@ def thermal_metrics(
         half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in `hot_region`; `thermal_mae_debiased_c` after the
         image's mean error is subtracted. A metric over no pixel is NaN.
     """
+    predicted = seen["thermal"]
     filled_p, filled_t = (torch.where(valid, image, torch.zeros_like(image)) for image in (predicted, target))
     error_k = (predicted - target) * span_k
     # The mean of no pixel is NaN.
@@ -140,8 +136,8 @@ def thermal_metrics(
         "thermal_ssim": ssim(filled_p, filled_t, valid),
         "thermal_hssim": hssim(filled_p, filled_t, valid),
         "thermal_mae_c": float(error_k[valid].abs().mean()),
-        "thermal_mae_hit_c": float(error_k[valid & (accumulation > 0.5)].abs().mean()),
-        "thermal_mae_box_c": float(error_k[valid & in_box].abs().mean()),
+        "thermal_mae_hit_c": float(error_k[valid & (seen["accumulation"] > 0.5)].abs().mean()),
+        "thermal_mae_box_c": float(error_k[valid & (seen["in_box"] > 0)].abs().mean()),
         "thermal_mae_roi_c": float(error_k[hot_region(target, valid)].abs().mean()),
         "thermal_mae_debiased_c": float((error_k - error_k[valid].mean())[valid].abs().mean()),
     }

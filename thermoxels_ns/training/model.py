@@ -390,8 +390,7 @@ class ThermoxelsModel(Model):
         if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
             valid = valid & batch["mask"].to(self.device).bool()
         if self.has_temperatures:
-            box, span_k = seen["in_box"] > 0, self.temperature_range.span_k
-            metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], box, span_k)
+            metrics |= thermal_metrics(seen, thermal, valid, self.temperature_range.span_k)
             both = torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1)
             images["thermal"] = colormaps.apply_float_colormap(both, "inferno")
         return metrics | self._fitted_metrics(outputs, seen, batch, valid), images
@@ -412,8 +411,7 @@ class ThermoxelsModel(Model):
             seen = outputs if own is None else self._rendered(own, THERMAL_STREAM)
             if self.has_temperatures:
                 thermal, span_k = batch["thermal"].to(self.device), self.temperature_range.span_k
-                box = seen["in_box"] > 0
-                warm = thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], box, span_k)
+                warm = thermal_metrics(seen, thermal, valid, span_k)
                 metrics["thermal_mae_debiased_c"] = warm["thermal_mae_debiased_c"]
         if self.grid.sh is not None:
             target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
