@@ -2,12 +2,13 @@ import io
 import json
 import math
 import types
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 
 from thermoxels_ns import cli
-from thermoxels_ns.commands.cost import FIGURES, Cost, cheapest, run_cost, table_of
+from thermoxels_ns.commands.cost import FIGURES, Cost, cheapest, table_of
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.training.schedule import schedule_for
 
@@ -66,9 +67,9 @@ def start(scene, tmp_path, commands):
     """Gives a function that runs the command and returns what it printed."""
 
     def run(**options) -> str:
-        screen = io.StringIO()
         defaults = {"settings": ("32:100", "64:400"), "qualities": ()}
-        run_cost(Cost(**({"scene": scene, "output_dir": tmp_path / "cost"} | defaults | options)), screen)
+        with redirect_stdout(io.StringIO()) as screen:
+            Cost(**({"scene": scene, "output_dir": tmp_path / "cost"} | defaults | options)).main()
         return screen.getvalue()
 
     return run

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TextIO
+from typing import Any
 
 import tyro
 
@@ -62,51 +62,46 @@ class Cost:
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
-        run_cost(self, sys.stdout)
-
-
-def run_cost(cost: Cost, screen: TextIO) -> None:
-    """Train and evaluate each setting that cost.json lacks, and print the table to `screen`; errors: `Cost.main`."""
-
-    def say(line: str) -> None:
-        print(line, file=screen)
-
-    if cost.target_mae is not None:
-        check_positive("target_mae", cost.target_mae, "Correct --target-mae, or leave it out.")
-    options = {text: training_options(text) for text in cost.settings}
-    options |= {quality: ("--quality", quality) for quality in cost.qualities}
-    if not options:
-        remedy = "Pass --settings 64:800."
-        raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
-    if not cost.methods:
-        raise ThermoxelsError("methods", expected="a method", got="none", remedy="Pass --methods thermoxels.")
-    if not cost.scene.is_dir():
-        raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
-    folder, scene, rows, failed = writable_folder(cost.output_dir), str(cost.scene.resolve()), dict[str, Row](), []
-    path, remedy = folder / _RUNS, "Remove the file to measure again, or choose another --output-dir."
-    with hold_folder(folder / ".lock", "Wait for it, or pass another --output-dir.", say):
-        runs = read_json_object(path, remedy) if path.is_file() else {}
-        for method in cost.methods:
-            for setting, words in options.items():
-                name = setting if method == cost.methods[0] else f"{setting}, {method}"
-                training = shlex.join(["ns-train", method, *words, "--data", scene])
-                run = f"Thermoxels {__version__}: {training}"
-                if run in runs:
-                    say(f"{name} is in {path} already; remove the file to measure again.")
-                else:
-                    try:
-                        runs[run] = _measure(cost.scene, method, words, name, folder, screen)
-                    except ThermoxelsError as problem:
-                        failed.append(f"{name}: {problem}")
-                        say(f"{name} failed: {problem}")
-                        continue
-                    write_json(path, runs)
-                rows[name] = {"training": training, **runs[run]}
-    for line in [*table_of(rows), "", *([] if cost.target_mae is None else [cheapest(rows, cost.target_mae)])]:
-        say(line)
-    if failed:
-        remedy = "Start the command again to repeat them. " + "\n".join(failed)
-        raise ThermoxelsError("cost", expected="every run to finish", got=f"{len(failed)} that did not", remedy=remedy)
+        if self.target_mae is not None:
+            check_positive("target_mae", self.target_mae, "Correct --target-mae, or leave it out.")
+        options = {text: training_options(text) for text in self.settings}
+        options |= {quality: ("--quality", quality) for quality in self.qualities}
+        if not options:
+            remedy = "Pass --settings 64:800."
+            raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
+        if not self.methods:
+            raise ThermoxelsError("methods", expected="a method", got="none", remedy="Pass --methods thermoxels.")
+        if not self.scene.is_dir():
+            raise SceneError(
+                "scene", expected="a scene folder", got=f"none at {self.scene}", remedy="Correct the path."
+            )
+        folder, scene, rows, failed = writable_folder(self.output_dir), str(self.scene.resolve()), dict[str, Row](), []
+        path, remedy = folder / _RUNS, "Remove the file to measure again, or choose another --output-dir."
+        with hold_folder(folder / ".lock", "Wait for it, or pass another --output-dir.", print):
+            runs = read_json_object(path, remedy) if path.is_file() else {}
+            for method in self.methods:
+                for setting, words in options.items():
+                    name = setting if method == self.methods[0] else f"{setting}, {method}"
+                    training = shlex.join(["ns-train", method, *words, "--data", scene])
+                    run = f"Thermoxels {__version__}: {training}"
+                    if run in runs:
+                        print(f"{name} is in {path} already; remove the file to measure again.")
+                    else:
+                        try:
+                            runs[run] = _measure(self.scene, method, words, name, folder)
+                        except ThermoxelsError as problem:
+                            failed.append(f"{name}: {problem}")
+                            print(f"{name} failed: {problem}")
+                            continue
+                        write_json(path, runs)
+                    rows[name] = {"training": training, **runs[run]}
+        for line in [*table_of(rows), "", *([] if self.target_mae is None else [cheapest(rows, self.target_mae)])]:
+            print(line)
+        if failed:
+            remedy = "Start the command again to repeat them. " + "\n".join(failed)
+            raise ThermoxelsError(
+                "cost", expected="every run to finish", got=f"{len(failed)} that did not", remedy=remedy
+            )
 
 
 def training_options(setting: str) -> tuple[str, ...]:
@@ -148,9 +143,7 @@ def cheapest(rows: Mapping[str, Row], target_mae: float) -> str:
     return f"Cheapest setting with {wanted}: {best}. Train with: {rows[best]['training']}"
 
 
-def _measure(
-    scene: Path, method: str, words: Sequence[str], name: str, folder: Path, screen: TextIO
-) -> dict[str, float | None]:
+def _measure(scene: Path, method: str, words: Sequence[str], name: str, folder: Path) -> dict[str, float | None]:
     """Train with the options `words`, evaluate, delete the model, and return all `FIGURES`; None: not measured.
 
     Logs go to the subfolder logs of `folder`. Raises `ThermoxelsError` if a command fails.
@@ -159,9 +152,9 @@ def _measure(
     output = logs / f"{name}.json"
     with TemporaryDirectory(dir=folder) as models:
         train = ["ns-train", method, "--data", str(scene), "--output-dir", models, "--experiment-name", name]
-        trained = run_command([*train, *PLAIN_TRAINING, *words], logs / f"{name}-train.log", screen)
+        trained = run_command([*train, *PLAIN_TRAINING, *words], logs / f"{name}-train.log", sys.stdout)
         config = str(Path(models) / name / method / "run" / "config.yml")
         evaluate = ["ns-eval", "--load-config", config, "--output-path", str(output)]
-        run_command(evaluate, logs / f"{name}-eval.log", screen)
+        run_command(evaluate, logs / f"{name}-eval.log", sys.stdout)
     found = trained._asdict() | read_json_object(output, "Start the command again; finished runs are kept.")["results"]
     return {figure: value if math.isfinite(value := found.get(figure, math.nan)) else None for figure in FIGURES}
