@@ -7,7 +7,7 @@ import numpy as np
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
-from thermoxels_ns.mesh.build import BoundaryMode, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_area_vectors
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -31,14 +31,14 @@ def exact_snapshot(signed_distance, lattice: Lattice, temperature_c=20.0, views:
     )
 
 
-def demo_mesh(scene_name: str, voxels: int, boundary: BoundaryMode = "conforming") -> TetMesh:
+def demo_mesh(scene_name: str, voxels: int, boundary="conforming") -> TetMesh:
     scene = make_scene(scene_name)
     lattice = Lattice.covering(*scene.scene_box, voxels)
     temperature_c = scene.surface_temperature_c(lattice.corner_positions().reshape(-1, 3)).reshape(lattice.shape)
     return _mesh(exact_snapshot(scene.solid.signed_distance, lattice, temperature_c), boundary)
 
 
-def _mesh(snapshot: GridSnapshot, boundary: BoundaryMode = "conforming") -> TetMesh:
+def _mesh(snapshot: GridSnapshot, boundary="conforming") -> TetMesh:
     return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4), boundary).mesh
 
 

@@ -260,7 +260,10 @@ def export_scene(
         files += _PICTURES[: 3 if support_of_facets(mesh) is None else 4]
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(ExportOptions)},
-        "versions": versions(),
+        "versions": {
+            **{"thermoxels": __version__, "python": platform.python_version()},
+            **{name: version(name) for name in ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")},
+        },
         "length_unit": unit,
         "scale": None if made.scale is None else asdict(made.scale),
         "up": made.up,
@@ -547,9 +550,3 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
     area = facet_areas(mesh.points_m, mesh.facets)
     total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
     return dict(zip(SUPPORT, (total / total.sum()).tolist()))
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of the packages that an export depends on."""
-    packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
-    return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}

@@ -165,11 +165,6 @@ class VoxelGrid(nn.Module):
         return values.view(self.lattice.shape)
 
     @torch.no_grad()
-    def corner_density(self) -> Float[Tensor, "x y z"]:
-        """Return the density at each corner of the lattice, [1 / world unit]; 0 at corners without a row."""
-        return self.corner_values(activate_density(self.density[:, 0], self.activation))
-
-    @torch.no_grad()
     def voxel_density(self) -> Float[Tensor, "x y z"]:
         """Return the density at the centre of each voxel, [1 / world unit]; 0 in voxels that are not kept."""
         corners, _, _ = self.voxels.tables(self.density.device)

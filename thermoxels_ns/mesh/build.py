@@ -27,9 +27,6 @@ from thermoxels_ns.mesh.temperature import (
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
-BoundaryMode = Literal["conforming", "voxel"]
-"""Course of a mesh's boundary: "conforming" follows the level set of the density, "voxel" follows voxel faces."""
-
 _NO_RULES = PatchRules()
 
 
@@ -49,7 +46,7 @@ def build_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     world_to_metres: FloatArray,
-    boundary: BoundaryMode = "conforming",
+    boundary: Literal["conforming", "voxel"] = "conforming",
     *,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     rules: PatchRules = _NO_RULES,

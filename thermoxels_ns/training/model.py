@@ -29,7 +29,7 @@ from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
-from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.field.voxel_grid import VoxelGrid, activate_density
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
 from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays, split_render
@@ -452,6 +452,7 @@ class ThermoxelsModel(Model):
         """
         grid, colour = self.grid, None
         thermal, thermal_weight, evidence = field_evidence(grid, self.sample_rays, rays)
+        density = activate_density(grid.density[:, 0], grid.activation)
         # Corners without a row get the middle of the range; nothing reads these values.
         thermal = grid.corner_values(thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
@@ -461,7 +462,7 @@ class ThermoxelsModel(Model):
             colour = torch.stack([grid.corner_values(rows, 0.5) for rows in channels], -1).cpu().numpy()
         return GridSnapshot(
             grid.lattice,
-            density=grid.corner_density().float().cpu().numpy(),
+            density=grid.corner_values(density.float()).cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
             observed_weight=grid.corner_values(thermal_weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
