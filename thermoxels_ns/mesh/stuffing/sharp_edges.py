@@ -166,4 +166,4 @@ def _goals(
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
     """Return for each of `count` nodes the sum, (count,), of `values` (f,) over the triangles `facets` around it."""
-    return np.bincount(facets.ravel(), np.repeat(values, 3), count)
+    return np.bincount(facets.ravel(), np.repeat(values, 3), count).astype(np.float64)
