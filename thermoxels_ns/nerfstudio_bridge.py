@@ -133,14 +133,12 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
 
 
 def _with_mesh_export(commands: Any) -> Any:
-    """Return `commands`, ``Annotated[Union[...], markers]`` or ``Union[...]``, with our subcommand as a new member."""
+    """Return `commands`, ``Annotated[Union[...], markers]``, with our subcommand as a new member of the union."""
     from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
-    markers = getattr(commands, "__metadata__", ())
-    members = get_args(get_args(commands)[0] if markers else commands)
-    extended = Union[(*members, ours)]
-    return Annotated[(extended, *markers)] if markers else extended
+    members, *markers = get_args(commands)
+    return Annotated[(Union[(*get_args(members), ours)], *markers)]
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
