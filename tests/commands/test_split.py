@@ -3,13 +3,15 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thermoxels_ns.cli import main
-from thermoxels_ns.commands.split import LIST, boxes_of_blocks, shares_shown
+from thermoxels_ns.commands.batch import read_list
+from thermoxels_ns.commands.split import LIST, boxes_of_blocks, photographs_of
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.lattice import Lattice
@@ -55,6 +57,7 @@ def test_blocks_are_scenes_of_the_photographs_that_show_them(blocks) -> None:
     with (blocks / "blocks" / LIST).open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert [line["name"] for line in lines] == ["block-1", "block-2"]
+    assert [*read_list(blocks / "blocks" / LIST)] == ["block-1", "block-2"], "a list for thermoxels batch"
     used = set()
     for line in lines:
         file = read_scene_file(blocks / "blocks" / line["scene"])
@@ -70,10 +73,12 @@ def test_blocks_are_scenes_of_the_photographs_that_show_them(blocks) -> None:
     assert used == set(whole), "the house is small: some photograph shows each part"
 
 
-def test_trainings_of_blocks_get_voxels_of_one_size(blocks) -> None:
+@pytest.mark.parametrize("factor", [1, 2])
+def test_trainings_of_blocks_get_voxels_of_one_size_and_keep_their_poses(blocks, monkeypatch, factor) -> None:
+    monkeypatch.setattr("thermoxels_ns.data.dataparser.refine_poses", lambda *_: pytest.fail("poses of a block alone"))
     found = []
     for name in ("block-1", "block-2"):
-        parser = ThermalDataParserConfig(data=blocks / "blocks" / name).setup()
+        parser = ThermalDataParserConfig(data=blocks / "blocks" / name, downscale_factor=factor).setup()
         outputs = parser.get_dataparser_outputs("train")
         found.append((outputs.metadata["pixel_size"], outputs.dataparser_scale))
         given = json.loads((blocks / "blocks" / name / "transforms.json").read_text())
@@ -105,8 +110,11 @@ def test_a_photograph_of_everything_is_in_its_best_block() -> None:
     camera = Camera(100, 100, 150.0, 150.0, 50.0, 50.0)
     frame = Frame("a", Path("a"), None, None, pose, camera, None, None)
     box = np.array([[0.0, -1.0, -1.0], [20.0, 1.0, 1.0]])
-    shares = shares_shown([frame], points, boxes_of_blocks(box, 20))
-    assert 0.0 < shares.max() < 0.1
+    near = replace(frame, pose=np.array([[1.0, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]))
+    away = replace(frame, pose=frame.pose @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    everything, close, nothing = photographs_of([frame, near, away], points, boxes_of_blocks(box, 20)).T
+    assert everything.any(), "its best block, although each holds less than a tenth of what it shows"
+    assert 1 < close.sum() < 6 and not nothing.any()
 
 
 @pytest.mark.parametrize("value", ["0.02 m", -1.0, True])

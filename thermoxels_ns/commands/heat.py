@@ -122,7 +122,11 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
 
     begin = clock.perf_counter()
-    if options.ranks != 1 and options.engine == "own":
+    engine = None
+    if options.engine == "dolfinx":
+        engine = DolfinxEngine(options.ranks, say)
+        _ = engine.command  # raises before anything slow
+    elif options.ranks != 1:
         raise HeatError("ranks", expected="--engine dolfinx beside it", got="none", remedy="Pass both, or neither.")
     if options.mesh is None or options.scene is None:
         missing = "mesh" if options.mesh is None else "scene"
@@ -143,17 +147,8 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
     read_s = clock.perf_counter() - begin
-    engine = DolfinxEngine(options.ranks, say)
     run = run_scene(
-        scene,
-        mesh,
-        goals,
-        up=up,
-        probes_m=options.probes,
-        export=export,
-        behind_m2k_w=behind,
-        say=say,
-        engine=None if options.engine == "own" else engine,
+        scene, mesh, goals, up=up, probes_m=options.probes, export=export, behind_m2k_w=behind, say=say, engine=engine
     )
     return replace(run, seconds={"read": read_s, **run.seconds})
 

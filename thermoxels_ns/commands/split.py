@@ -78,8 +78,7 @@ class Split:
         if found.points is not None:
             inside = found.points[((found.points >= found.box[0]) & (found.points <= found.box[1])).all(axis=1)]
             points = inside[:: max(len(inside) // _PROBES, 1)]
-        shares = shares_shown(file.frames, points, boxes)
-        shown = (shares >= _IN_BLOCK) | ((shares == shares.max(axis=0)) & (shares > 0.0))
+        shown = photographs_of(file.frames, points, boxes)
         if not shown.any(axis=0).all():
             print(
                 f"{np.count_nonzero(~shown.any(axis=0))} photographs show nothing of the scene's box, and are left out"
@@ -124,13 +123,17 @@ def boxes_of_blocks(box: FloatArray, count: int) -> FloatArray:
     return boxes
 
 
-def shares_shown(frames: Sequence[Frame], points: FloatArray, boxes: FloatArray) -> FloatArray:
-    """Return, of the points (n, 3) that each photograph shows, the share in each box, shape (boxes, photographs)."""
+def photographs_of(frames: Sequence[Frame], points: FloatArray, boxes: FloatArray) -> BoolArray:
+    """Return which photographs belong to each block, (blocks, photographs), by the points (n, 3) that they show.
+
+    A photograph belongs to each block that holds the share `_IN_BLOCK` of these points, or the most of them.
+    """
     from thermoxels_ns.data.scene_box import depths_in_view
 
     seen = np.isfinite(depths_in_view(points, frames))
     inside = np.stack([((points >= low) & (points <= high)).all(axis=1) for low, high in boxes])
-    return (inside[:, None] & seen).sum(axis=2) / np.maximum(seen.sum(axis=1), 1)
+    shares = (inside[:, None] & seen).sum(axis=2) / np.maximum(seen.sum(axis=1), 1)
+    return (shares > 0.0) & ((shares >= _IN_BLOCK) | (shares == shares.max(axis=0)))
 
 
 def write_block(folder: Path, file: SceneFile, box: FloatArray, chosen: BoolArray, pixel_size: float) -> None:

@@ -11,6 +11,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,9 @@ class DolfinxEngine:
         if self.ranks < 1:
             raise HeatError("ranks", expected="at least 1", got=self.ranks, remedy="Pass --ranks 2, for example.")
 
-    def __call__(self, system: HeatSystem, times_s: FloatArray) -> FloatArray:
-        """Return the temperatures minus `system.reference_c` at the ends of the steps, shape (s, n), [K].
-
-        The steps of backward Euler lead from one of `times_s` (s + 1,), [s], to the next, from the initial temperature;
-        the one time 0 asks for the steady state instead. Raises `HeatError` if DOLFINx is not there or fails.
-        """
+    @cached_property
+    def command(self) -> list[str]:
+        """Words that start Python in all processes; raises `HeatError` if DOLFINx or mpirun is not there."""
         python = os.environ.get(PYTHON, "/usr/bin/python3")
         remedy = f"Install python3-dolfinx (Debian, Ubuntu), let {PYTHON} name a Python that has it, or leave --engine."
         if shutil.which(python) is None:
@@ -57,7 +55,15 @@ class DolfinxEngine:
         mpirun = str(beside) if beside.is_file() else shutil.which("mpirun")
         if self.ranks > 1 and mpirun is None:
             raise HeatError("ranks", expected="mpirun on the path", got="none", remedy="Leave --ranks, or install MPI.")
-        command = [python] if mpirun is None or self.ranks == 1 else [mpirun, "-n", str(self.ranks), python]
+        return [python] if mpirun is None or self.ranks == 1 else [mpirun, "-n", str(self.ranks), python]
+
+    def __call__(self, system: HeatSystem, times_s: FloatArray) -> FloatArray:
+        """Return the temperatures minus `system.reference_c` at the ends of the steps, shape (s, n), [K].
+
+        The steps of backward Euler lead from one of `times_s` (s + 1,), [s], to the next, from the initial temperature;
+        the one time 0 asks for the steady state instead. Raises `HeatError` if DOLFINx is not there or fails.
+        """
+        command = self.command
         with (
             plain_os_errors("files for DOLFINx", remedy="Free space, or let TMPDIR name a folder with more."),
             tempfile.TemporaryDirectory(prefix="thermoxels-dolfinx-") as folder,
