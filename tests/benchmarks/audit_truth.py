@@ -13,8 +13,9 @@ known to 1 K and with one contact temperature known to 0.2 K in its place, and o
 With --trained the whole way is in the loop: a house with a room, a window in each of two walls, a door and a balcony
 slab is solved under what each seed draws, photographed by a camera that errs as stated (noise 0.1 K, drift 0.5 K,
 exposure 0.2 stops, poses 0.1 degrees), trained, exported and audited by the commands that a user types, and beside it
-the solved mesh itself ("no training"), so that what reconstruction adds shows. Each audit's figures are rows of
-``audit_truth.csv`` in the output folder, written as they come; seeds that are there are not run again.
+the solved mesh itself ("no training"), so that what reconstruction adds shows; with `--trained no` only that, which
+takes seconds for a house. Each audit's figures are rows of ``audit_truth.csv`` in the output folder, written as they
+come; seeds that are there are not run again. `--first-seed` lets several processes share the seeds of a folder.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
 from outside with a contact temperature, of the wall from inside. With --calibrate --history-h 48 the wall (of a time
@@ -118,21 +119,20 @@ def trained_mesh(truth: Truth, stated: Conditions, folder: Path, quality: str, s
     return mesh
 
 
-def run_trained(output: Path, quality: str, seeds: int) -> None:
+def run_trained(output: Path, quality: str, seeds: range) -> None:
     """Train and audit the houses that the output folder does not have yet, and print what all say."""
     path = output / "audit_truth.csv"
     done = {(row["quality"], row["seed"]) for row in read_rows(path)}
-    for seed in range(seeds):
+    for seed in seeds:
         if (quality, str(seed)) in done:
             continue
         draws = true_draws(STATED, seed)
         truth, plain = (solve_wall(house_mesh(slab=slab), STATED, draws) for slab in (True, False))
         folder = output / f"{quality} {seed}"
         shutil.rmtree(folder, ignore_errors=True)
-        meshes = {
-            "no training": photographed(truth, STATED, seed),
-            "trained": trained_mesh(truth, STATED, folder, quality, seed),
-        }
+        meshes = {"no training": photographed(truth, STATED, seed)}
+        if quality != "no":
+            meshes["trained"] = trained_mesh(truth, STATED, folder, quality, seed)
         contact = with_contact(STATED, truth, seed, CONTACT_M)
         rows = [
             {"quality": quality, "seed": seed, "audit": f"{how}, {known}", "quantity": name, "true": true}
@@ -181,8 +181,10 @@ class AuditTruth:
     """Of --calibrate: photograph after a warm day, of which the weather file knows so many hours; 0: steady, [h]."""
     balance: bool = False
     """Draw the formula of convection."""
-    trained: Literal["draft", "standard"] | None = None
-    """Photograph, train and export solved houses of this quality, and audit these."""
+    trained: Literal["no", "draft", "standard"] | None = None
+    """Audit solved houses: photographed, trained and exported in this quality, or as they were solved."""
+    first_seed: int = 0
+    """Of --trained."""
     output: Path = Path("audit-truth")
     """Folder for the rows and logs of --trained."""
 
@@ -190,7 +192,7 @@ class AuditTruth:
         rows: Rows = {}
         refused: Counter[str] = Counter()
         if self.trained:
-            return run_trained(self.output, self.trained, self.seeds)
+            return run_trained(self.output, self.trained, range(self.first_seed, self.first_seed + self.seeds))
         if self.calibrate and self.history_h > 0.0:
             with TemporaryDirectory() as folder:
                 for seed, side, steady in product(range(self.seeds), ("outside", "inside"), (False, True)):
