@@ -155,6 +155,9 @@ def test_a_ceiling_lies_on_the_hull_of_the_walls():
     seen_outside = replace(evidence, feature_rays=rays.joined_with(through_a_window)).plain_rays(*box)
     assert seen_outside is not None and np.abs(seen_outside.points[:, 2] - 3.0).max() < 0.1
     assert replace(evidence, feature_rays=None).plain_rays(*box) is None
+    with_walls = replace(evidence, ceiling=np.ones_like(is_ceiling)).plain_rays(*box)  # all that looks like the ceiling
+    assert with_walls is not None and len(to_ceiling.point) <= len(with_walls.point) < 1.05 * len(to_ceiling.point)
+    assert np.abs(with_walls.points[:, 2] - 3.0).max() < 0.1
     low = replace(rays, points=rays.points * (1.0, 1.0, 0.3))  # below the cameras, which see no ceiling from there
     assert replace(evidence, feature_rays=low).plain_rays(*box) is None
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.multiview.backdrop import upwards
 from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
 from thermoxels_ns.multiview.stereo import depths_before_backdrop, depths_of, feature_rays_to_depths, rays_through
@@ -20,6 +21,9 @@ LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
 TAIL = 0.5  # Share of points left out at either end of each axis, for the hull on which a ceiling lies, [%]
 FEWEST_POINTS = 100  # Points in the box that such a hull needs
+LEAST_UP = 0.5
+"""Least cosine between the vertical and the normal of a side of the hull that may be a ceiling: 60 degrees. In two
+drawn rooms 0.9 chooses the same rays within 2 %."""
 CEILING_ERROR = 0.02  # Standard error of a ceiling's depth, of the depth; in a drawn living room 1.8 % in the median
 LEAST_GAIN = 0.01  # Gains are corrected if the root mean square of their logarithms is above this
 LEAST_OFFSET_K = 0.1  # Offsets of thermal images are corrected if their root mean square is above this, [K]
@@ -43,8 +47,9 @@ class PhotographEvidence:
         """Return one ray per plain pixel: to a point far behind the box from `lo` to `hi`, or to a point on a ceiling.
 
         A ceiling is taken to lie on the convex hull of the known points in the box, without the outermost points along
-        each axis (`TAIL`). None if fewer than `LEAST_SHARE` of the pixels have a ray, or if a ceiling has fewer than
-        `FEWEST_POINTS` known points.
+        each axis (`TAIL`). A pixel whose ray leaves the hull through a steep side (`LEAST_UP`) has no ray: it may show
+        a plain wall that looks like the ceiling, and that may be nearer. None if fewer than `LEAST_SHARE` of the pixels
+        have a ray, or if a ceiling has fewer than `FEWEST_POINTS` known points.
         """
         (chosen,) = np.nonzero(self.backdrop | self.ceiling)
         if len(chosen) < LEAST_SHARE * len(self.backdrop):
@@ -60,12 +65,14 @@ class PhotographEvidence:
         low, high = np.percentile(points, (TAIL, 100.0 - TAIL), axis=0)
         hull = ConvexHull(points[((points >= low) & (points <= high)).all(axis=1)])
         origins, along = self.photographs.of_pixels(chosen)
-        depth = np.full(len(chosen), np.inf)
+        depth, up, is_above = np.full(len(chosen), np.inf), upwards(self.photographs), np.zeros(len(chosen), dtype=bool)
         for *normal, offset in hull.equations:
             outwards = along @ normal
             with np.errstate(divide="ignore"):
-                depth = np.minimum(depth, np.where(outwards > 0.0, -(origins @ normal + offset) / outwards, np.inf))
-        inside = (depth > 0.0) & np.isfinite(depth)
+                here = np.where(outwards > 0.0, -(origins @ normal + offset) / outwards, np.inf)
+            is_above[here < depth] = up @ normal > LEAST_UP
+            depth = np.minimum(depth, here)
+        inside = (depth > 0.0) & np.isfinite(depth) & is_above
         if inside.sum() < LEAST_SHARE * len(self.ceiling):
             return None
         depth = depth[inside]

@@ -6,7 +6,7 @@ import dataclasses
 import re
 import zlib
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -358,15 +358,17 @@ def wall_object() -> SyntheticScene:
     return dataclasses.replace(scene, background_rgb=plain(seen.tolist()))
 
 
-def living_room() -> SyntheticScene:
+def living_room(corner: bool = False) -> SyntheticScene:
     """Build a furnished room of 5.2 x 4.2 x 2.7 m, photographed from inside, with white walls and a plain ceiling.
 
-    Walls are 17 to 19 C, and colder in the corners of the outer wall. Its window has 12 C and its radiator 45 C.
+    Walls are 17 to 19 C, and colder in the corners of the outer wall. Its window has 12 C and its radiator 45 C. With
+    `corner`, walls cut one corner off, so that the room is L-shaped.
     """
     x, y, high, thick = 2.6, 2.1, 2.7, 0.25
     radiator: Box = ((x - 0.12, -1.0, 0.12), (x, 0.6, 0.75))
     outer: list[Box] = [((side - thick, -y - thick, 0.0), (side, y + thick, high)) for side in (-x, x + thick)]
     inner: list[Box] = [((-x, side - thick, 0.0), (x, side, high)) for side in (-y, y + thick)]
+    inner += [((0.4, 0.3, 0.0), (x, y, high))] * corner
     legs: list[Box] = [((a, b, 0.0), (a + 0.06, b + 0.06, 0.7)) for a in (-0.48, 0.42) for b in (-0.33, 0.27)]
     wood = Paint((0.55, 0.42, 0.30), 0.2)
     plan = _plan(
@@ -383,6 +385,12 @@ def living_room() -> SyntheticScene:
         recess_m=0.12,
     )
 
+    along_arms = (
+        CameraRing((-1.1, -0.9, 1.4), 0.9, 1.5),
+        CameraWalk(((-1.2, 1.6, 1.6), (-0.6, -1.2, 1.5)), ((-0.8, -y, 1.3), (x, -1.0, 1.3))),
+        CameraWalk(((2.0, -1.0, 1.5), (-0.8, -0.4, 1.6)), ((-x, -1.0, 1.3), (-1.2, y, 1.3))),
+    )
+
     def temperature_c(points: npt.ArrayLike) -> FloatArray:
         points = np.asarray(points, dtype=np.float64)
         across, along, z = points.T
@@ -396,13 +404,13 @@ def living_room() -> SyntheticScene:
         plan,
         texture_seed=5,
         light=SunLight(),
-        name="living-room",
+        name="l-room" if corner else "living-room",
         scene_box=((-x - 0.4, -y - 0.4, -0.4), (x + 0.4, y + 0.4, high + 0.4)),
         temperature_bounds_c=(5.0, 50.0),
         surface_temperature_c=temperature_c,
         background_rgb=sky_rgb,
         background_temperature_c=lambda directions: sky_temperature_c(directions, 10.0, 3.0),
-        rings=rings_around((0.0, 0.0), (1.35, 1.6, 1.5), (0.9, 1.5, 1.9), (1.9, 1.45, 1.1)),
+        rings=along_arms if corner else rings_around((0.0, 0.0), (1.35, 1.6, 1.5), (0.9, 1.5, 1.9), (1.9, 1.45, 1.1)),
         focal_share=0.62,
     )
 
@@ -489,10 +497,11 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "pipes": pipes,
     "wall-object": wall_object,
     "living-room": living_room,
+    "l-room": partial(living_room, corner=True),
     "facade": facade,
     "street": street,
 }
-DEVELOPMENT_NAMES = ("wall-object", "living-room", "facade", "street")
+DEVELOPMENT_NAMES = ("wall-object", "living-room", "l-room", "facade", "street")
 """Names of hand-drawn scenes that are hard, for development."""
 SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
 """Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
