@@ -75,10 +75,15 @@ def test_all_effects_in_a_steady_state_and_through_time(engine, heat_problem) ->
 
 
 @pytest.mark.parametrize("engine", [2], indirect=True)
-def test_a_body_that_DOLFINx_would_tear_is_refused(engine, random_body) -> None:
-    """Its voxels touch by edges alone in two places."""
-    with pytest.raises(HeatError, match="tears between processes"):
-        solve_heat(HeatProblem(random_body, STEEL), FOUR_HOURS, engine=engine)
+def test_a_body_that_DOLFINx_would_tear_is_refused_or_solved(engine, random_body) -> None:
+    """Its voxels touch by edges alone in two places, at which DOLFINx does not always divide it among processes."""
+    problem = HeatProblem(random_body, STEEL)
+    try:
+        theirs = solve_heat(problem, FOUR_HOURS, engine=engine)
+    except HeatError as problem_found:
+        assert "tears between processes" in str(problem_found)
+    else:
+        agree(theirs, solve_heat(problem, FOUR_HOURS))
 
 
 @pytest.mark.parametrize(("fixed", "time"), [(True, None), (True, 40), (False, 40)])
