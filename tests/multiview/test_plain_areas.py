@@ -151,9 +151,14 @@ def test_a_ceiling_lies_on_the_hull_of_the_walls():
     assert to_ceiling is not None and len(to_ceiling.point) == is_ceiling.sum()
     assert np.abs(to_ceiling.points[:, 2] - 3.0).max() < 0.1
     outside = np.random.default_rng(0).uniform((10.0, -9.0, 0.0), (20.0, 9.0, 9.0), (len(rays.point) // 20, 3))
-    through_a_window = FeatureRays(outside, np.arange(len(outside)), outside, np.zeros(len(outside)))
+    through_a_window = FeatureRays(0.0 * outside, np.arange(len(outside)), outside, np.zeros(len(outside)))
     seen_outside = replace(evidence, feature_rays=rays.joined_with(through_a_window)).plain_rays(*box)
     assert seen_outside is not None and np.abs(seen_outside.points[:, 2] - 3.0).max() < 0.1
+    inexact = np.arange(len(rays.point)) % 3 == 0
+    points = rays.points * np.where(inexact, np.random.default_rng(1).normal(1.0, 0.1, len(inexact)), 1.0)[:, None]
+    of_mixed = replace(rays, points=points, uncertainty=np.where(inexact, 1.0, rays.uncertainty))
+    by_the_exact = replace(evidence, feature_rays=of_mixed).plain_rays(*box)
+    assert by_the_exact is not None and np.abs(by_the_exact.points[:, 2] - 3.0).max() < 0.1
     assert replace(evidence, feature_rays=None).plain_rays(*box) is None
     with_walls = replace(evidence, ceiling=np.ones_like(is_ceiling)).plain_rays(*box)  # all that looks like the ceiling
     assert with_walls is not None and len(to_ceiling.point) <= len(with_walls.point) < 1.05 * len(to_ceiling.point)

@@ -12,7 +12,7 @@ from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
-from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
+from thermoxels_ns.multiview.stereo import Depths, depths_of, feature_rays_to_depths
 from thermoxels_ns.multiview.stereo_kernels import add_differences
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
@@ -101,7 +101,7 @@ def test_where_photographs_share_nothing_no_depth_is_sure(colours):
 
 @pytest.mark.parametrize("chosen", [[0], [0, 1], [4, 4, 4, 4]])
 def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
-    assert len(set(chosen)) <= FEWEST_VIEWS
+    """Two other photographs have to agree."""
     assert depths(photographs([EYES[number] for number in chosen])).share == 0.0
     assert depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0)).share == 0.0  # behind all cameras
 
@@ -143,12 +143,29 @@ def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars
         if np.flatnonzero((seen.centres == view.centre).all(1))[0] < liars:
             x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (COLUMN, ROW)))
             depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
-        return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32)
+        return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32), np.full(SIZE * SIZE, 2.0, np.float32)
 
     monkeypatch.setattr(stereo, "_sweep", sweep)
     found = depths(seen).depth
     assert bool((found == np.float32(1.4)).any()) == sure
     assert np.mean(found == np.float32(TRUE_DEPTH)) > 0.3
+
+
+@pytest.mark.parametrize(
+    "eye", [(0.5, 0.0, 1.6), (0.25, 0.1, 2.6), (0.3, 0.0, 0.9)], ids=["beside", "behind", "before"]
+)
+def test_from_plane_to_plane_the_picture_moves_by_a_pixel_wherever_the_other_camera_stands(eye):
+    """If planes are even in inverse depth, the picture of a camera behind moves by 3 pixels where surfaces are far."""
+    seen = photographs([(0.0, 0.0, 1.6), eye])
+    depths = 1.0 / stereo._planes(seen, 0, [1], near=0.3, far=3.0, endless=False)
+    assert (np.diff(depths) < 0.0).all()
+    points = np.stack(np.broadcast_arrays(0.0, 0.0, 1.6 - depths), -1)  # through the middle pixel
+    place = points @ seen.matrices[1, :, :3].T + seen.matrices[1, :, 3]
+    moved = np.linalg.norm(np.diff(place[:, :2] / place[:, 2:], axis=0), axis=1)
+    shown = seen.shown(1, points)[2]
+    both = shown[1:] & shown[:-1]
+    assert both.sum() > 20
+    assert moved[both].min() > 0.6 and moved[both].max() < 1.4
 
 
 @pytest.mark.parametrize(("beyond", "share"), [(0.2, 0.1), (0.8, 0.0)])
@@ -222,7 +239,7 @@ def test_shallow_ramps_have_depths_in_photographs_of_any_exposure(exposure, monk
     assert found.share > 0.2
     assert np.nanquantile(np.abs(found.depth - TRUE_DEPTH), 0.95) < 0.03
     monkeypatch.setattr(stereo, "DIFFERENCE", 0.0)
-    assert depths_of(seen, LO, HI).share < 0.02
+    assert depths_of(seen, LO, HI).share < 0.2 * found.share
 
 
 @pytest.mark.parametrize("lost", ["nothing", "a hole in each", "all of some"])

@@ -46,10 +46,11 @@ class PhotographEvidence:
     def plain_rays(self, lo: FloatArray, hi: FloatArray) -> FeatureRays | None:
         """Return one ray per plain pixel: to a point far behind the box from `lo` to `hi`, or to a point on a ceiling.
 
-        A ceiling is taken to lie on the convex hull of the known points in the box, without the outermost points along
-        each axis (`TAIL`). A pixel whose ray leaves the hull through a steep side (`LEAST_UP`) has no ray: it may show
-        a plain wall that looks like the ceiling, and that may be nearer. None if fewer than `LEAST_SHARE` of the pixels
-        have a ray, or if a ceiling has fewer than `FEWEST_POINTS` known points.
+        A ceiling is taken to lie on the convex hull of known points in the box: of the half of least relative error,
+        since errors push the hull outwards, and without the outermost along each axis (`TAIL`). A pixel whose ray
+        leaves the hull through a steep side (`LEAST_UP`) has no ray: it may show a plain wall that looks like the
+        ceiling, and that may be nearer. None if fewer than `LEAST_SHARE` of the pixels have a ray, or if a ceiling has
+        fewer than `FEWEST_POINTS` known points.
         """
         (chosen,) = np.nonzero(self.backdrop | self.ceiling)
         if len(chosen) < LEAST_SHARE * len(self.backdrop):
@@ -58,7 +59,11 @@ class PhotographEvidence:
             return rays_through(self.photographs, chosen, np.full(len(chosen), BEYOND * np.linalg.norm(hi - lo)))
         from scipy.spatial import ConvexHull  # slow to import and only needed here
 
-        points = np.zeros((0, 3)) if self.feature_rays is None else self.feature_rays.points
+        points, rays = np.zeros((0, 3)), self.feature_rays
+        if rays is not None:
+            points = rays.points[rays.point]
+            error = rays.uncertainty / np.linalg.norm(points - rays.origins, axis=1)
+            points = points[error <= (1.0 + 1e-5) * np.median(error)]  # equal ones count as equal
         points = points[((points >= lo) & (points <= hi)).all(axis=1)]  # a window shows things outside, too
         if len(points) < FEWEST_POINTS:
             return None

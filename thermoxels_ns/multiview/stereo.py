@@ -27,7 +27,7 @@ LIKENESS = 0.025
 """Least scale s, of 1, of the weights exp(-(d / s)^2) in a patch (see `weigh_patches`), where d is the difference of a
 pixel from the middle pixel."""
 LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
-PLANES = (24, 128)
+PLANES = (24, 256)
 """Least and most planes per photograph. Between these limits the picture moves by about a pixel from plane to plane."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
 """Standard deviations of the noise of brightness, of 1, and of temperature, of the scene's range. They are also the
@@ -44,9 +44,11 @@ STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side; a correlation r costs
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
-MARGIN = 0.06  # Least cost by which the best plane must beat every plane more than two planes away
+MARGIN, WIDEST = 0.06, 4
+"""The best plane must beat every plane more than `WIDEST` planes away by the cost `MARGIN`. How far away the farthest
+plane is that it does not beat, at least two planes, says how exact the depth is, and how many photographs must agree:
+the less exact, the more."""
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by at most this share of the sum of plane spacings
-FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
 VIEWS_TO_CONTRADICT = 3
 """A depth may contradict others only if so many other photographs agree with it. F of the facade is 0.974 with this, in
@@ -55,9 +57,9 @@ seeds do."""
 PAIRS_IN_LINE = 3  # Least number, of the four pairs of opposite neighbours, with which a sure pixel must be in line
 LEAST_CORRELATION = 0.6  # Least correlation at which a depth on the farthest plane is accepted
 ERROR_PLANES = 0.1
-"""Standard error of a depth that trainings and votes assume, in spacings of planes. Of single pixels 68 % are within
-0.26 to 0.29 (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade, courtyard
-and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
+"""Standard error of a depth that trainings and votes assume, relative to `Depths.error`. Of single pixels 68 % are
+within 0.26 to 0.29 (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade,
+courtyard and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
 """Value of a pixel that a photograph does not show. Interpolation between this value and other pixels is below 0."""
@@ -75,7 +77,9 @@ class Depths:
     photographs: Photographs
     depth: Float32Array
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: Float32Array  # Spacing of the planes of the sweep at each depth, shape (pixels,), [world units]
+    error: Float32Array
+    """Half the distance from each depth to the farthest plane that is not beaten (`MARGIN`), at least to the second,
+    shape (pixels,), [world units]. It is the spacing of planes where texture fixes the depth well."""
 
     @property
     def share(self) -> float:
@@ -97,10 +101,10 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     like the middle one count: otherwise pixels beside an outline would take the outline's depth. The cost of a plane is
     low correlation plus the difference of the pixels (`DIFFERENCE`). Costs are summed along paths through the
     photograph (Hirschmueller 2008), so that a pixel without texture takes the depth of similar pixels beside it. The
-    plane of least cost gives the depth if it beats all planes more than two planes away by `MARGIN`. A depth is sure if
-    enough other photographs have a depth at the same point, if few photographs look through the point, and if the
-    surrounding pixels lie in line with it. Planes reach through the box and behind it; without a box, they reach
-    through the depths at which views overlap.
+    plane of least cost gives the depth if it beats all planes farther than `WIDEST` planes away by `MARGIN`. A depth is
+    sure if as many other photographs have a depth at the same point as there are planes to the farthest that is not
+    beaten, if few photographs look through the point, and if the surrounding pixels lie in line with it. Planes reach
+    through the box and behind it; without a box, they reach through the depths at which views overlap.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their width.
@@ -110,7 +114,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
     total = len(photographs.colours)
-    depth, error = (np.full(total, np.nan, np.float32) for _ in range(2))
+    depth, spacing, width = (np.full(total, np.nan, np.float32) for _ in range(3))
 
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
@@ -118,31 +122,33 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
             span = _overlap(photographs, number) if corners is None else _span(view, *corners, photographs.near)
             if span is None:
                 continue
-            near = [views[other] for other in _neighbours(photographs, number, *span)]
-            if near:
+            others = _neighbours(photographs, number, *span)
+            if others:
+                planes = _planes(photographs, number, others, *span, corners is not None)
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.shape[0] * view.shape[1])
-                depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
+                found = _sweep(view, [views[other] for other in others], planes, corners is not None)
+                depth[pixels], spacing[pixels], width[pixels] = found
 
     run_ranges(work, len(views), 1)
-    confirmed = other_views(photographs, depth, error)[0] >= VIEWS_TO_CONTRADICT
-    agreeing, behind = other_views(photographs, depth, error, confirmed)
-    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
+    confirmed = other_views(photographs, depth, spacing)[0] >= VIEWS_TO_CONTRADICT
+    agreeing, behind = other_views(photographs, depth, spacing, confirmed)
+    sure = (agreeing >= width) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
     for view, first in zip(views, photographs.firsts):
         pixels = slice(first, first + view.shape[0] * view.shape[1])
-        agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
+        agree = _neighbours_agree(depth[pixels].reshape(view.shape), spacing[pixels].reshape(view.shape))
         depth[pixels][~agree.ravel()] = np.nan
-    return Depths(photographs, depth, error)
+    return Depths(photographs, depth, 0.5 * width * spacing)
 
 
 def other_views(
-    photographs: Photographs, depth: Float32Array, error: Float32Array, confirmed: BoolArray | None = None
+    photographs: Photographs, depth: Float32Array, spacing: Float32Array, confirmed: BoolArray | None = None
 ) -> tuple[IntArray, IntArray]:
     """Return for each pixel the number of other photographs that agree with its depth, and that look through its point.
 
-    A photograph agrees if its depth at the point differs by at most `TOLERANCE` times the sum of both pixels' `error`,
-    the spacings of planes. It looks through the point if its depth there is `confirmed` and farther by more than twice
+    A photograph agrees if its depth at the point differs by at most `TOLERANCE` times the sum of both pixels' `spacing`
+    of planes. It looks through the point if its depth there is `confirmed` and farther by more than twice
     that sum. All arrays are (pixels,); a `depth` of NaN is unknown.
     """
     agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
@@ -154,7 +160,7 @@ def other_views(
         points, number = origins + depth[own, None] * along, np.searchsorted(photographs.firsts, own, side="right") - 1
         for other in range(len(photographs)):
             pixel, far, shown = photographs.shown(other, points)
-            farther, planes = depth[pixel] - far, error[pixel] + error[own]  # NaN fails both comparisons
+            farther, planes = depth[pixel] - far, spacing[pixel] + spacing[own]  # NaN fails both comparisons
             shown &= number != other
             agreeing[own] += shown & (np.abs(farther) <= TOLERANCE * planes)
             if confirmed is not None:
@@ -255,13 +261,13 @@ def _neighbours(photographs: Photographs, number: int, near: float, far: float) 
     return [int(other) for other in best if worth[other] > 0.0]
 
 
-def _sweep(view: _View, others: list[_View], near: float, far: float, endless: bool) -> tuple[FloatArray, ...]:
-    """Return depths, NaN where not sure, and spacings of planes at these depths, (pixels,) each, [world units]. Planes
-    reach from depth `near` to `far`; if `endless` is True, more planes stand behind `far`."""
-    inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
-    beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
-    farthest = 0.5 * inverse_depths[0] / max(1, beyond)
-    inverse_depths = np.concatenate((np.linspace(farthest, inverse_depths[0], beyond, endpoint=False), inverse_depths))
+def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless: bool) -> tuple[FloatArray, ...]:
+    """Return depths, NaN where not sure, spacings of planes at them, both [world units], and how many planes away the
+    farthest is that is not beaten (`MARGIN`), at least two; (pixels,) each.
+
+    Planes stand at `inverse_depths` (planes,), farthest first; if `endless`, what is behind them is matched on the
+    farthest.
+    """
     weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
     means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
     weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
@@ -288,15 +294,15 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     total = np.empty_like(cost)
     aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)
-    away = np.abs(np.arange(total.shape[-1]) - best[..., None]) > 2
-    elsewhere = np.where(away, total, np.inf).min(-1)
-    sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
+    unbeaten = total < np.take_along_axis(total, best[..., None], -1) + MARGIN
+    width = np.where(unbeaten, np.abs(np.arange(total.shape[-1]) - best[..., None]), 2).max(-1)
+    sure = width <= WIDEST
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
     # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
-    sure &= (best > 0) | ((beyond > 0) & correlates)
+    sure &= (best > 0) | (endless & correlates)
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
-    return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
+    return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel(), width.ravel()
 
 
 def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -323,29 +329,43 @@ def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, 
     return expected, limit
 
 
-def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
+def _neighbours_agree(depth: Float32Array, spacing: Float32Array) -> BoolArray:
     """Return which pixels (h, w) lie in line with at least `PAIRS_IN_LINE` of their four pairs of opposite neighbours.
     On a plane, inverse depth is linear in the image. A pixel is in line if it is off the middle of the pair by at most
-    the spacing of planes, `error`."""
+    the `spacing` of planes."""
     height, width = depth.shape
     framed, count = 1.0 / np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
     for row, column in ((0, 0), (0, 1), (0, 2), (1, 0)):
         one, other = (framed[r : r + height, c : c + width] for r, c in ((row, column), (2 - row, 2 - column)))
-        count += np.abs(one + other - 2.0 / depth) <= 2.0 * error / depth**2
+        count += np.abs(one + other - 2.0 / depth) <= 2.0 * spacing / depth**2
     return count >= PAIRS_IN_LINE
 
 
-def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Return the number of planes for which the view's middle pixel moves by at most about a pixel per plane in
-    every other photograph, within the limits `PLANES`."""
-    height, width = view.shape
-    middle = view.centre + np.outer((near, far), view.inverse @ (0.5 * width, 0.5 * height, 1.0))
-    most = 0.0
+def _planes(
+    photographs: Photographs, number: int, others: list[int], near: float, far: float, endless: bool
+) -> FloatArray:
+    """Return the inverse depths of the planes for the sweep of photograph `number`, farthest first, (planes,). They
+    reach from depth `far`, or from infinity if `endless`, to depth `near`.
+
+    From plane to plane the picture moves by about a pixel, within the limits `PLANES`, in that photograph of `others`
+    in which it moves most. This is not even in inverse depth where cameras stand one behind the other, as in a room:
+    the picture then moves much where surfaces are far and little where they are near. Depths at which no other
+    photograph sees what this one does get no planes.
+    """
+    inverse_depths = np.linspace(1e-6 / far if endless else 1.0 / far, 1.0 / near, PLANES[1])
+    points, moves = _probes(photographs, number, 1.0 / inverse_depths), np.zeros(len(inverse_depths) - 1)
     for other in others:
-        x, y, depth = other.matrix[:, :3] @ middle.T + other.matrix[:, 3:]
-        if (depth > 0.0).all():
-            most = max(most, float(np.hypot(np.diff(x / depth), np.diff(y / depth))[0]))
-    return int(np.clip(np.ceil(most) + 1, *PLANES)) if most > 0.0 else PLANES[1]
+        seen = points @ photographs.matrices[other, :, :3].T + photographs.matrices[other, :, 3]
+        shown = photographs.shown(other, points)[2].reshape(len(inverse_depths), -1)
+        place = (seen[:, :2] / np.where(seen[:, 2:] > 0.0, seen[:, 2:], np.inf)).reshape(*shown.shape, 2)
+        both = shown[1:] & shown[:-1]
+        enough = both.mean(axis=1) >= _FEWEST_PROBES
+        moved = np.where(both, np.linalg.norm(np.diff(place, axis=0), axis=2), np.nan)[enough]
+        moves[enough] = np.maximum(moves[enough], np.nanmedian(moved, axis=1))
+    pixels = np.append(0.0, np.cumsum(np.maximum(moves, 1e-6)))  # ascending
+    planes = int(np.clip(np.ceil(pixels[-1]) + 1, *PLANES))
+    farthest = 0.5 * pixels[-1] / planes if endless else 0.0
+    return np.interp(np.linspace(farthest, pixels[-1], planes), pixels, inverse_depths)
 
 
 def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> None:
@@ -379,7 +399,7 @@ def _between(cost: Float32Array, best: IntArray) -> FloatArray:
 
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     """Return one feature ray per sure pixel, each to a point of its own, photograph after photograph, [world units].
-    The uncertainty of a ray is `ERROR_PLANES` times the spacing of planes, measured along the ray."""
+    The uncertainty of a ray is `ERROR_PLANES` times `Depths.error`, measured along the ray."""
     (sure,) = np.nonzero(np.isfinite(depths.depth))
     depth, error = (values[sure].astype(np.float64) for values in (depths.depth, depths.error))
     return rays_through(depths.photographs, sure, depth, ERROR_PLANES * error)
