@@ -151,7 +151,7 @@ def test_a_ceiling_lies_on_the_hull_of_the_walls():
     assert to_ceiling is not None and len(to_ceiling.point) == is_ceiling.sum()
     assert np.abs(to_ceiling.points[:, 2] - 3.0).max() < 0.1
     outside = np.random.default_rng(0).uniform((10.0, -9.0, 0.0), (20.0, 9.0, 9.0), (len(rays.point) // 20, 3))
-    through_a_window = FeatureRays(0.0 * outside, np.arange(len(outside)), outside, np.zeros(len(outside)))
+    through_a_window = FeatureRays(outside, np.arange(len(outside)), outside, np.zeros(len(outside)))
     seen_outside = replace(evidence, feature_rays=rays.joined_with(through_a_window)).plain_rays(*box)
     assert seen_outside is not None and np.abs(seen_outside.points[:, 2] - 3.0).max() < 0.1
     inexact = np.arange(len(rays.point)) % 3 == 0

@@ -101,7 +101,7 @@ def test_where_photographs_share_nothing_no_depth_is_sure(colours):
 
 @pytest.mark.parametrize("chosen", [[0], [0, 1], [4, 4, 4, 4]])
 def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
-    """Two other photographs have to agree."""
+    assert len(set(chosen)) <= 2  # so many others have to agree
     assert depths(photographs([EYES[number] for number in chosen])).share == 0.0
     assert depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0)).share == 0.0  # behind all cameras
 
@@ -239,7 +239,7 @@ def test_shallow_ramps_have_depths_in_photographs_of_any_exposure(exposure, monk
     assert found.share > 0.2
     assert np.nanquantile(np.abs(found.depth - TRUE_DEPTH), 0.95) < 0.03
     monkeypatch.setattr(stereo, "DIFFERENCE", 0.0)
-    assert depths_of(seen, LO, HI).share < 0.2 * found.share
+    assert depths_of(seen, LO, HI).share < 0.02
 
 
 @pytest.mark.parametrize("lost", ["nothing", "a hole in each", "all of some"])

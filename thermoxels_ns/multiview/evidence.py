@@ -62,7 +62,7 @@ class PhotographEvidence:
         points, rays = np.zeros((0, 3)), self.feature_rays
         if rays is not None:
             points = rays.points[rays.point]
-            error = rays.uncertainty / np.linalg.norm(points - rays.origins, axis=1)
+            error = rays.uncertainty / np.maximum(np.linalg.norm(points - rays.origins, axis=1), 1e-12)
             points = points[error <= (1.0 + 1e-5) * np.median(error)]  # equal ones count as equal
         points = points[((points >= lo) & (points <= hi)).all(axis=1)]  # a window shows things outside, too
         if len(points) < FEWEST_POINTS:

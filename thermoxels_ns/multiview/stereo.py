@@ -44,7 +44,7 @@ STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side; a correlation r costs
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
-MARGIN, WIDEST = 0.06, 4
+MARGIN, WIDEST = 0.06, 3
 """The best plane must beat every plane more than `WIDEST` planes away by the cost `MARGIN`. How far away the farthest
 plane is that it does not beat, at least two planes, says how exact the depth is, and how many photographs must agree:
 the less exact, the more."""
