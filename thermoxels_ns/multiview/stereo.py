@@ -44,10 +44,8 @@ STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side; a correlation r costs
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
-MARGIN, WIDEST = 0.06, 3
-"""The best plane must beat every plane more than `WIDEST` planes away by the cost `MARGIN`. How far away the farthest
-plane is that it does not beat, at least two planes, says how exact the depth is, and how many photographs must agree:
-the less exact, the more."""
+MARGIN = 0.06  # Cost by which the best plane must beat every plane more than two planes away
+FEWEST_VIEWS = 2  # Fewest other photographs that must agree with a depth
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by at most this share of the sum of plane spacings
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
 VIEWS_TO_CONTRADICT = 3
@@ -57,7 +55,7 @@ seeds do."""
 PAIRS_IN_LINE = 3  # Least number, of the four pairs of opposite neighbours, with which a sure pixel must be in line
 LEAST_CORRELATION = 0.6  # Least correlation at which a depth on the farthest plane is accepted
 ERROR_PLANES = 0.1
-"""Standard error of a depth that trainings and votes assume, relative to `Depths.error`. Of single pixels 68 % are
+"""Standard error of a depth that trainings and votes assume, in spacings of planes. Of single pixels 68 % are
 within 0.26 to 0.29 (house-corner, facade, courtyard), but errors average out over a surface: with 0.25, F of facade,
 courtyard and wild-14 was 0.014, 0.004 and 0.058 lower, and rendered depths were 1.6, 1.2 and 1.4 times as far off."""
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
@@ -77,9 +75,7 @@ class Depths:
     photographs: Photographs
     depth: Float32Array
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: Float32Array
-    """Half the distance from each depth to the farthest plane that is not beaten (`MARGIN`), at least to the second,
-    shape (pixels,), [world units]. It is the spacing of planes where texture fixes the depth well."""
+    error: Float32Array  # Spacing of the planes of the sweep at each depth, shape (pixels,), [world units]
 
     @property
     def share(self) -> float:
@@ -101,10 +97,10 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     like the middle one count: otherwise pixels beside an outline would take the outline's depth. The cost of a plane is
     low correlation plus the difference of the pixels (`DIFFERENCE`). Costs are summed along paths through the
     photograph (Hirschmueller 2008), so that a pixel without texture takes the depth of similar pixels beside it. The
-    plane of least cost gives the depth if it beats all planes farther than `WIDEST` planes away by `MARGIN`. A depth is
-    sure if as many other photographs have a depth at the same point as there are planes to the farthest that is not
-    beaten, if few photographs look through the point, and if the surrounding pixels lie in line with it. Planes reach
-    through the box and behind it; without a box, they reach through the depths at which views overlap.
+    plane of least cost gives the depth if it beats all planes farther than two planes away by `MARGIN`. A depth is sure
+    if `FEWEST_VIEWS` other photographs have a depth at the same point, if few photographs look through the point, and
+    if the surrounding pixels lie in line with it. Planes reach through the box and behind it; without a box, they reach
+    through the depths at which views overlap.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their width.
@@ -114,7 +110,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
     total = len(photographs.colours)
-    depth, spacing, width = (np.full(total, np.nan, np.float32) for _ in range(3))
+    depth, error = (np.full(total, np.nan, np.float32) for _ in range(2))
 
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
@@ -128,18 +124,18 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.shape[0] * view.shape[1])
                 found = _sweep(view, [views[other] for other in others], planes, corners is not None)
-                depth[pixels], spacing[pixels], width[pixels] = found
+                depth[pixels], error[pixels] = found
 
     run_ranges(work, len(views), 1)
-    confirmed = other_views(photographs, depth, spacing)[0] >= VIEWS_TO_CONTRADICT
-    agreeing, behind = other_views(photographs, depth, spacing, confirmed)
-    sure = (agreeing >= width) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
+    confirmed = other_views(photographs, depth, error)[0] >= VIEWS_TO_CONTRADICT
+    agreeing, behind = other_views(photographs, depth, error, confirmed)
+    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
     for view, first in zip(views, photographs.firsts):
         pixels = slice(first, first + view.shape[0] * view.shape[1])
-        agree = _neighbours_agree(depth[pixels].reshape(view.shape), spacing[pixels].reshape(view.shape))
+        agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
         depth[pixels][~agree.ravel()] = np.nan
-    return Depths(photographs, depth, 0.5 * width * spacing)
+    return Depths(photographs, depth, error)
 
 
 def other_views(
@@ -262,8 +258,7 @@ def _neighbours(photographs: Photographs, number: int, near: float, far: float) 
 
 
 def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless: bool) -> tuple[FloatArray, ...]:
-    """Return depths, NaN where not sure, spacings of planes at them, both [world units], and how many planes away the
-    farthest is that is not beaten (`MARGIN`), at least two; (pixels,) each.
+    """Return depths, NaN where not sure, and spacings of planes at these depths, (pixels,) each, [world units].
 
     Planes stand at `inverse_depths` (planes,), farthest first; if `endless`, what is behind them is matched on the
     farthest.
@@ -294,15 +289,15 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     total = np.empty_like(cost)
     aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)
-    unbeaten = total < np.take_along_axis(total, best[..., None], -1) + MARGIN
-    width = np.where(unbeaten, np.abs(np.arange(total.shape[-1]) - best[..., None]), 2).max(-1)
-    sure = width <= WIDEST
+    away = np.abs(np.arange(total.shape[-1]) - best[..., None]) > 2
+    elsewhere = np.where(away, total, np.inf).min(-1)
+    sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
     # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
     sure &= (best > 0) | (endless & correlates)
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
-    return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel(), width.ravel()
+    return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
 
 
 def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, Float32Array]:
