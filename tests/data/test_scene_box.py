@@ -121,6 +121,18 @@ def test_strays_and_a_street_behind_do_not_count_but_a_chimney_does(tmp_path):
     assert (box[0] < -0.98 * BLOCK).all() and (box[1] > [0.49, 0.34, 0.6]).all() and (np.abs(box) < 0.75).all(), box
 
 
+def test_inexact_points_count_little_and_exact_ones_from_near_not_more_than_others(tmp_path):
+    """A tenth of the points are wrong, inexact ones behind a block, and another tenth show a detail from very near."""
+    draw, frames = np.random.default_rng(6), frames_of(tmp_path, [around(n) for n in range(24)])
+    block = BLOCK * draw.uniform(-1.0, 1.0, (1600, 3))
+    wrong = draw.uniform([-1.0, -1.0, -0.2], [1.0, 1.0, 0.2], (200, 3))
+    detail = draw.uniform(-0.02, 0.02, (200, 3))
+    points, error = np.concatenate((block, wrong, detail)), np.repeat([0.01, 0.05, 0.0001], (1600, 200, 200))
+    for box, most in ((box_of_points(points, frames, error), 0.65), (box_of_points(points, frames), 1.1)):
+        assert (box[0] < -BLOCK).all() and (box[1] > BLOCK).all() and (np.abs(box) < most).all(), box
+    assert (np.abs(box_of_points(points, frames)) > 0.9).any()
+
+
 @pytest.mark.parametrize("reach", [0.6, 0.82, 2.0])
 def test_a_ground_that_runs_on_stays(tmp_path, reach):
     """A table or a yard is seen as well as what stands on it; what is exported is chosen later."""

@@ -143,7 +143,7 @@ def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars
         if np.flatnonzero((seen.centres == view.centre).all(1))[0] < liars:
             x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (COLUMN, ROW)))
             depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
-        return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32), np.full(SIZE * SIZE, 2.0, np.float32)
+        return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32)
 
     monkeypatch.setattr(stereo, "_sweep", sweep)
     found = depths(seen).depth

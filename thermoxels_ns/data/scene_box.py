@@ -90,16 +90,17 @@ def find_scene_box(
         good = tracks.well_seen()
         points = good if len(good) >= _FEWEST_POINTS else tracks.points
         return FoundBox(f"the points of {tracks.source}", box_of_points(points, frames), points)
-    points, photographs = _points_of_photographs([frames[index] for index in training])
+    points, error, photographs = _points_of_photographs([frames[index] for index in training])
     if len(points) < _FEWEST_DEPTHS:
         source = "the cameras (no scene_box, no sparse points, no depths that photographs agree on)"
         return FoundBox(source, box_of_cameras(frames))
     source = f"{len(points)} depths on which {photographs} photographs agree"
-    return FoundBox(source, box_of_points(points, frames), points)
+    return FoundBox(source, box_of_points(points, frames, error), points)
 
 
-def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
-    """Return stereo points (n, 3) on which photographs agree, in input coordinates, and the number of photographs."""
+def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, FloatArray, int]:
+    """Return stereo points (n, 3) on which photographs agree, in input coordinates, their standard errors along the
+    ray (n,), and the number of photographs."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
     frames = _spread(frames, _STEREO_PHOTOGRAPHS)
@@ -111,30 +112,35 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
     depths = stereo.depths_of(seen)
     depths = stereo.depths_before_backdrop(depths)[0]
-    return stereo.feature_rays_to_depths(depths).points, len(frames)
+    rays = stereo.feature_rays_to_depths(depths)
+    return rays.points, rays.uncertainty, len(frames)
 
 
-def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
+def box_of_points(points: FloatArray, frames: Sequence[Frame], error: FloatArray | None = None) -> Box:
     """Return the box around those of the points (n, 3), in input coordinates, that photographs show well.
 
-    `Views.shown_well` decides which points photographs show well; the export chooses its region by the same rule. Each
+    Points whose standard errors (n,) are known count by the density that they stand for, one over the cube of the
+    error, but none for more than the point of median error: what is far behind the scene, and wrong, is inexact. Of
+    points without errors those count that photographs show well (`Views.shown_well`), as in the export's region; each
     camera is taken to be pointed at the median depth of the points in its view. Along each axis, `_TAIL` of the points
     at either end are left out, and `_MARGIN` is added on both sides, because parts without texture have no points and a
     flat scene needs some depth. If a photograph, as of a plain wall, has hardly any of these points in view
     (`_FEW_IN_VIEW`), the box is extended to the point on its optical axis at the median of the cameras' depths.
     """
-    points = points[np.isfinite(points).all(axis=1)]
-    points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
+    weight = np.ones(len(points)) if error is None else np.minimum(1.0, np.median(error) / error) ** 3
+    chosen = np.flatnonzero(np.isfinite(points).all(axis=1))
+    chosen, frames = chosen[:: max(len(chosen) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
+    points, weight = points[chosen], weight[chosen]
     depth = depths_in_view(points, frames)
     seen = np.isfinite(depth)
     ahead = np.array([np.median(row[known]) if known.any() else np.nan for row, known in zip(depth, seen)])
     views = Views.of([frame.intrinsics for frame in frames], [frame.pose for frame in frames])
-    kept = seen.any(axis=0) & views.shown_well(points, ahead)
-    points, shown = points[kept], seen[:, kept].sum(axis=1)
+    kept = seen.any(axis=0) & (views.shown_well(points, ahead) if error is None else True)
+    points, weight, shown = points[kept], weight[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
         raise SceneError("sparse points", expected=expected, got=len(points), remedy=_REMEDY)
-    low, high = np.percentile(points, (_TAIL, 100.0 - _TAIL), axis=0)
+    low, high = (_weighted_percentile(points, weight, percent) for percent in (_TAIL, 100.0 - _TAIL))
     margin = _MARGIN * (high - low).max()
     few = shown < _FEW_IN_VIEW * shown.max()
     if few.any():
@@ -146,6 +152,14 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     low, high = low - margin, high + margin
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
     return _checked(np.stack([low, high]), "box of the points")
+
+
+def _weighted_percentile(points: FloatArray, weight: FloatArray, percent: float) -> FloatArray:
+    """Return the coordinate (3,) along each axis below which `percent` of the weights (n,) of the points (n, 3) lie."""
+    order = np.argsort(points, axis=0)
+    below = np.cumsum(weight[order], axis=0) - 0.5 * weight[order]
+    ascending = np.take_along_axis(points, order, axis=0)
+    return np.array([np.interp(0.01 * percent * weight.sum(), *pair) for pair in zip(below.T, ascending.T)])
 
 
 def depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
