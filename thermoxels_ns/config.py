@@ -12,7 +12,7 @@ from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.core.yaml_records import configs_folder, read_yaml, with_overrides
 from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
-from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
+from thermoxels_ns.training.optimizers import FusedAdamConfig, LateDecaySchedulerConfig, RowAdamConfig, RowRMSpropConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline, ThermoxelsPipelineConfig
 from thermoxels_ns.training.schedule import QUALITIES
 from thermoxels_ns.training.trainer import LOCAL_HOST, ThermoxelsTrainerConfig
@@ -23,17 +23,26 @@ ThermoxelsPipeline.compare_with_truth = nerfstudio_bridge.compare_with_truth
 _, ITERATIONS, VOXEL_PIXELS = QUALITIES["standard"]
 
 
-def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict:
-    return {
-        "optimizer": optimizer(lr=lr),
-        "scheduler": ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=ITERATIONS),
-    }
+Scheduler = type[ExponentialDecaySchedulerConfig]
+
+
+def _group(
+    lr: float, lr_final: float, optimizer: type[OptimizerConfig], scheduler: Scheduler = ExponentialDecaySchedulerConfig
+) -> dict:
+    return {"optimizer": optimizer(lr=lr), "scheduler": scheduler(lr_final=lr_final, max_steps=ITERATIONS)}
 
 
 def _trainer(
-    optimizer: type[OptimizerConfig] = RowAdamConfig, dense: type[OptimizerConfig] = FusedAdamConfig
+    optimizer: type[OptimizerConfig] = RowAdamConfig,
+    dense: type[OptimizerConfig] = FusedAdamConfig,
+    values: Scheduler = LateDecaySchedulerConfig,
 ) -> ThermoxelsTrainerConfig:
-    """Return the default training; `optimizer` is for rows of the voxel grid, `dense` for arrays updated as a whole."""
+    """Return the default training; `optimizer` is for rows of the voxel grid, `dense` for arrays updated as a whole,
+    `values` for the learning rates of colours and temperatures.
+
+    Colours and temperatures end at a fiftieth of the first rate: few rays meet each of many small voxels, and a rate
+    that is still high leaves the noise of the last of them (docs/accuracy.md).
+    """
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,
@@ -49,12 +58,12 @@ def _trainer(
         ),
         optimizers={
             "density": _group(0.3, 0.03, optimizer),
-            "sh": _group(0.1, 0.01, optimizer),
-            "temperature": _group(0.02, 0.002, optimizer),
-            "background": _group(0.05, 0.005, dense),
+            "sh": _group(0.1, 0.002, optimizer, values),
+            "temperature": _group(0.02, 0.0004, optimizer, values),
+            "background": _group(0.05, 0.001, dense, values),
             "surroundings_density": _group(0.3, 0.03, optimizer),
-            "surroundings_sh": _group(0.1, 0.01, optimizer),
-            "surroundings_temperature": _group(0.02, 0.002, optimizer),
+            "surroundings_sh": _group(0.1, 0.002, optimizer, values),
+            "surroundings_temperature": _group(0.02, 0.0004, optimizer, values),
             "corrections": _group(0.002, 0.0002, dense),
         },
         viewer=ViewerConfig(websocket_host=LOCAL_HOST, quit_on_train_completion=True),
@@ -62,13 +71,15 @@ def _trainer(
     )
 
 
-def _preset(name: str, *optimizers: type[OptimizerConfig]) -> MethodSpecification:
+def _preset(name: str, default: ThermoxelsTrainerConfig) -> MethodSpecification:
     content = read_yaml(configs_folder() / f"{name}.yaml")
     description = content.pop("description")
-    return MethodSpecification(with_overrides(_trainer(*optimizers), content), description)
+    return MethodSpecification(with_overrides(default, content), description)
 
 
 thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")
-thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig, RowRMSpropConfig)
-thermoxels_arco = _preset("thermoxels-arco")
-plenoxels_t = _preset("plenoxels-t")
+thermoxels_paper = _preset(
+    "thermoxels-paper", _trainer(RowRMSpropConfig, RowRMSpropConfig, ExponentialDecaySchedulerConfig)
+)
+thermoxels_arco = _preset("thermoxels-arco", _trainer())
+plenoxels_t = _preset("plenoxels-t", _trainer())

@@ -7,7 +7,7 @@ import torch
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.training.optimizers import RowAdam, RowOptimizer, RowRMSprop, touched_rows
+from thermoxels_ns.training.optimizers import LateDecaySchedulerConfig, RowAdam, RowOptimizer, RowRMSprop, touched_rows
 
 ROWS, CHANNELS = 50, 6
 KINDS = {"adam": RowAdam, "rmsprop": RowRMSprop}
@@ -173,3 +173,16 @@ def test_state_follows_split_and_pruned_rows(kind, change):
         rows = torch.tensor([0, len(new) - 1])
         step(optimizer, new, torch.sparse_coo_tensor(rows[None], torch.ones(2, new.shape[1]), new.shape))
         assert (new != before).any(-1).nonzero()[:, 0].tolist() == rows.tolist()
+
+
+def test_a_rate_that_falls_late_is_high_for_most_of_a_run_and_stays_low_after_it():
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.5)
+    schedule = LateDecaySchedulerConfig(lr_final=0.01, max_steps=100).setup().get_scheduler(optimizer, 0.5)
+    rates = []
+    for _ in range(150):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates[0] == 0.5 and rates[50] == pytest.approx(0.255) and rates[90] < 0.03
+    assert rates == sorted(rates, reverse=True)
+    assert rates[100:] == pytest.approx([0.01] * 50)

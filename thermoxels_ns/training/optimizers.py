@@ -1,7 +1,8 @@
-"""Optimisers that update only rows with a gradient, and their settings for nerfstudio."""
+"""Optimisers that update only rows with a gradient, a learning rate that falls late, and settings for nerfstudio."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -9,7 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecayScheduler, ExponentialDecaySchedulerConfig
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.field.refine import GridChange
@@ -165,3 +168,27 @@ class FusedAdamConfig(AdamOptimizerConfig):
     """Number added to the root of the second moment."""
     fused: bool = True
     """Use PyTorch's fused implementation."""
+
+
+class LateDecayScheduler(ExponentialDecayScheduler):
+    """Learning rate that falls to `lr_final` along half a cosine (Loshchilov and Hutter 2017) and stays there.
+
+    An exponential decay that ends as low is low for most of the run already; one that ends higher leaves noise. (Not
+    nerfstudio's cosine, which rises again if a training goes on past `max_steps`.)
+    """
+
+    def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
+        """Return the schedule of an optimiser whose learning rate begins as `lr_init`."""
+        least = 1.0 if self.config.lr_final is None else self.config.lr_final / lr_init
+
+        def share(step: int) -> float:
+            return least + (1.0 - least) * 0.5 * (1.0 + math.cos(math.pi * min(step / self.config.max_steps, 1.0)))
+
+        return LambdaLR(optimizer, share)
+
+
+@dataclass
+class LateDecaySchedulerConfig(ExponentialDecaySchedulerConfig):
+    """Settings of `LateDecayScheduler`; it has no warm-up."""
+
+    _target: type = LateDecayScheduler
