@@ -127,7 +127,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], error: FloatArray
     flat scene needs some depth. If a photograph, as of a plain wall, has hardly any of these points in view
     (`_FEW_IN_VIEW`), the box is extended to the point on its optical axis at the median of the cameras' depths.
     """
-    weight = np.ones(len(points)) if error is None else np.minimum(1.0, np.median(error) / error) ** 3
+    weight = np.ones(len(points)) if error is None else np.power(np.minimum(1.0, np.median(error) / error), 3.0)
     chosen = np.flatnonzero(np.isfinite(points).all(axis=1))
     chosen, frames = chosen[:: max(len(chosen) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
     points, weight = points[chosen], weight[chosen]
