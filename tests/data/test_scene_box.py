@@ -9,7 +9,7 @@ from PIL import Image
 from tests.support.scene_folders import look_at_origin
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.scene_box import box_of_points, find_scene_box
+from thermoxels_ns.data.scene_box import box_of_points, exactness, find_scene_box
 from thermoxels_ns.data.scene_file import Frame, read_scene_file
 from thermoxels_ns.synthetic.scene_truth import look_at
 
@@ -121,16 +121,17 @@ def test_strays_and_a_street_behind_do_not_count_but_a_chimney_does(tmp_path):
     assert (box[0] < -0.98 * BLOCK).all() and (box[1] > [0.49, 0.34, 0.6]).all() and (np.abs(box) < 0.75).all(), box
 
 
-def test_inexact_points_count_little_and_exact_ones_from_near_not_more_than_others(tmp_path):
-    """A tenth of the points are wrong, inexact ones behind a block, and another tenth show a detail from very near."""
+def test_inexact_points_count_little_and_photographs_of_a_detail_not_more_than_others(tmp_path):
+    """A tenth of a photograph's points are wrong and inexact, and most photographs show a detail from very near."""
     draw, frames = np.random.default_rng(6), frames_of(tmp_path, [around(n) for n in range(24)])
     block = BLOCK * draw.uniform(-1.0, 1.0, (1600, 3))
-    wrong = draw.uniform([-1.0, -1.0, -0.2], [1.0, 1.0, 0.2], (200, 3))
-    detail = draw.uniform(-0.02, 0.02, (200, 3))
-    points, error = np.concatenate((block, wrong, detail)), np.repeat([0.01, 0.05, 0.0001], (1600, 200, 200))
-    for box, most in ((box_of_points(points, frames, error), 0.65), (box_of_points(points, frames), 1.1)):
-        assert (box[0] < -BLOCK).all() and (box[1] > BLOCK).all() and (np.abs(box) < most).all(), box
-    assert (np.abs(box_of_points(points, frames)) > 0.9).any()
+    wrong = draw.uniform([-1.0, -1.0, -0.2], [1.0, 1.0, 0.2], (160, 3))
+    detail = draw.uniform(-0.02, 0.02, (2000, 3))
+    points, counts = np.concatenate((block, wrong, detail)), (1600, 160, 2000)
+    weight = exactness(np.repeat([0.01, 0.05, 0.0001], counts), np.repeat([0, 0, 1], counts))
+    box, without = box_of_points(points, frames, weight), box_of_points(points, frames)
+    assert (box[0] < -BLOCK).all() and (box[1] > BLOCK).all() and (np.abs(box) < 0.65).all(), box
+    assert (np.abs(without) > 0.9).any()
 
 
 @pytest.mark.parametrize("reach", [0.6, 0.82, 2.0])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import Float32Array, FloatArray
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.scene_file import Frame, SceneFile
@@ -20,9 +20,9 @@ Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
 _TAIL = 0.5
-"""Points left outside the box at either end of an axis, [%], because some are wrong. It was chosen on a synthetic block
-before far walls, with 0.7 % wrong depths: 0.1 makes its box 1.5 times as long. A mast of fewer points is inside the box
-only because of `_MARGIN`."""
+"""Weight of points left outside the box at either end of an axis, [%], because some are wrong. It was chosen on a
+synthetic block before far walls, with 0.7 % wrong depths: 0.1 makes its box 1.5 times as long. A mast of fewer points
+is inside the box only because of `_MARGIN`."""
 _MARGIN = 0.08  # Width added on every side, relative to the longest side of the box
 _ROUNDED = 2.0**-8  # Corners are rounded to this share of the longest side, or less
 _MOST_POINTS = 20_000  # Number of points, evenly chosen, to which larger sets are reduced (about)
@@ -90,17 +90,17 @@ def find_scene_box(
         good = tracks.well_seen()
         points = good if len(good) >= _FEWEST_POINTS else tracks.points
         return FoundBox(f"the points of {tracks.source}", box_of_points(points, frames), points)
-    points, error, photographs = _points_of_photographs([frames[index] for index in training])
+    points, weight, photographs = _points_of_photographs([frames[index] for index in training])
     if len(points) < _FEWEST_DEPTHS:
         source = "the cameras (no scene_box, no sparse points, no depths that photographs agree on)"
         return FoundBox(source, box_of_cameras(frames))
     source = f"{len(points)} depths on which {photographs} photographs agree"
-    return FoundBox(source, box_of_points(points, frames, error), points)
+    return FoundBox(source, box_of_points(points, frames, weight), points)
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, FloatArray, int]:
-    """Return stereo points (n, 3) on which photographs agree, in input coordinates, their standard errors along the
-    ray (n,), and the number of photographs."""
+    """Return stereo points (n, 3) on which photographs agree, in input coordinates, their weights (n,) for the box
+    (`exactness`), and the number of photographs."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
     frames = _spread(frames, _STEREO_PHOTOGRAPHS)
@@ -113,21 +113,34 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, FloatAr
     depths = stereo.depths_of(seen)
     depths = stereo.depths_before_backdrop(depths)[0]
     rays = stereo.feature_rays_to_depths(depths)
-    return rays.points, rays.uncertainty, len(frames)
+    return rays.points, exactness(rays.uncertainty, seen.numbers[np.isfinite(depths.depth)]), len(frames)
 
 
-def box_of_points(points: FloatArray, frames: Sequence[Frame], error: FloatArray | None = None) -> Box:
+def exactness(error: FloatArray, photograph: IntArray) -> FloatArray:
+    """Return weights (n,) of points with standard errors (n,), each found in the photograph of that number (n,).
+
+    A point counts by the density that it stands for, one over the cube of its error, but at most 1, which is the weight
+    of the photograph's point of median error. So what is far behind a scene, and wrong, hardly counts, and photographs
+    of a detail from near do not outweigh the others.
+    """
+    weight = np.ones(len(error))
+    for number in np.unique(photograph):
+        own = photograph == number
+        weight[own] = np.minimum(1.0, np.median(error[own]) / error[own]) ** 3
+    return weight
+
+
+def box_of_points(points: FloatArray, frames: Sequence[Frame], weight: FloatArray | None = None) -> Box:
     """Return the box around those of the points (n, 3), in input coordinates, that photographs show well.
 
-    Points whose standard errors (n,) are known count by the density that they stand for, one over the cube of the
-    error, but none for more than the point of median error: what is far behind the scene, and wrong, is inexact. Of
-    points without errors those count that photographs show well (`Views.shown_well`), as in the export's region; each
-    camera is taken to be pointed at the median depth of the points in its view. Along each axis, `_TAIL` of the points
-    at either end are left out, and `_MARGIN` is added on both sides, because parts without texture have no points and a
-    flat scene needs some depth. If a photograph, as of a plain wall, has hardly any of these points in view
-    (`_FEW_IN_VIEW`), the box is extended to the point on its optical axis at the median of the cameras' depths.
+    `Views.shown_well` decides which points photographs show well; the export chooses its region by the same rule. Each
+    camera is taken to be pointed at the median depth of the points in its view. Along each axis, `_TAIL` of the weights
+    (n,) of the points (None: all alike) at either end are left out, and `_MARGIN` is added on both sides, because parts
+    without texture have no points and a flat scene needs some depth. If a photograph, as of a plain wall, has hardly
+    any of these points in view (`_FEW_IN_VIEW`), the box is extended to the point on its optical axis at the median of
+    the cameras' depths.
     """
-    weight = np.ones(len(points)) if error is None else np.power(np.minimum(1.0, np.median(error) / error), 3.0)
+    weight = np.ones(len(points)) if weight is None else weight
     chosen = np.flatnonzero(np.isfinite(points).all(axis=1))
     chosen, frames = chosen[:: max(len(chosen) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
     points, weight = points[chosen], weight[chosen]
@@ -135,7 +148,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], error: FloatArray
     seen = np.isfinite(depth)
     ahead = np.array([np.median(row[known]) if known.any() else np.nan for row, known in zip(depth, seen)])
     views = Views.of([frame.intrinsics for frame in frames], [frame.pose for frame in frames])
-    kept = seen.any(axis=0) & (views.shown_well(points, ahead) if error is None else True)
+    kept = seen.any(axis=0) & views.shown_well(points, ahead)
     points, weight, shown = points[kept], weight[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
