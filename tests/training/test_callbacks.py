@@ -41,6 +41,8 @@ def model_of(**options) -> ThermoxelsModel:
 class Rays:
     """Stands for the data manager: rays along -x onto the slab, and two cameras that have the box in view."""
 
+    config = SimpleNamespace(train_num_rays_per_batch=10**6)
+
     def __init__(self, places: torch.Tensor | None = None):
         self.places = torch.linspace(-0.97, 0.97, 30) if places is None else places
         poses = np.stack([look_at((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))[:3]] * 2)
@@ -213,6 +215,17 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
     assert model.config.resolutions == ((8,) if voxel_pixels else (8, 32))
     assert given.trainer.saved == ([(8,)] if voxel_pixels else []), "what is resumed knows it"
     assert model.grid.lattice.cell_shape == (8, 8, 8) and len(model.grid.voxels) == 8**3
+
+
+@pytest.mark.parametrize(("rays", "voxel_pixels", "side"), [(4096, 1.6, 16), (4095, 1.6, 8), (4095, 0.0, 16)])
+def test_a_refinement_for_which_rays_are_few_is_left_out_unless_somebody_asked_for_it(rays, voxel_pixels, side):
+    """Of the last two steps each gives as many rays as 8^3 voxels of a surface need for a refinement by two."""
+    model = model_of(resolutions=(8, 16), refine_at=(2,), prune_threshold=0.0, voxel_pixels=voxel_pixels)
+    given: Any = attributes(model, 4)
+    given.pipeline.datamanager.config = SimpleNamespace(train_num_rays_per_batch=rays)
+    assert [*steps_of(model, given, 3)][-1] == 2
+    assert model.grid.lattice.cell_shape == (side, side, side)
+    assert given.trainer.saved == ([(8,)] if side == 8 else [])
 
 
 def test_progress_is_told_at_each_twentieth_and_after_a_silence(monkeypatch, capsys):

@@ -32,6 +32,10 @@ from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_ra
 FEWEST_OPEN_RAYS = 0.002  # A background is kept if at least this share of rays leaves the box with half of its light
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
+FEWEST_RAYS = 4.0
+"""Least number of rays, in the steps to come, per voxel of a surface for a refinement that the user did not ask for. It
+is 3 to 4 where standard quality had noisier colours and temperatures than draft (living-room, ARCO, saharov32), above 4
+in wild-14 and l-room (4.3), where the refinement gains shape, and in thirty other scenes (7.8 to 33)."""
 MOST_OPENED_RAYS = 0.01  # Largest share, of the rays of opacity above one half, that pruning may open
 OPAQUE_DEPTH = 0.7  # Least optical depth across an opaque voxel: half of the light is lost
 PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # Number of lines of progress; a line comes at least this often
@@ -121,12 +125,17 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         if step in factors:
             lattice = model.grid.lattice.refined(factors[step])
             voxels, channels = len(model.grid.voxels) * factors[step] ** 3, config.row_channels(max(lattice.cell_shape))
+            rays = math.inf if end is None else (end - step) * datamanager.config.train_num_rays_per_batch
+            needed = FEWEST_RAYS * len(model.grid.voxels) * factors[step] ** 2
             try:
                 CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, config.memory_budget_gb)}")
+                why = "" if rays >= needed else f"{rays:,} rays to come are few for so many; --quality fine has more"
             except MemoryBudgetError as problem:
+                why = str(problem)
                 if not config.voxel_pixels:  # the user gave this resolution
                     raise
-                CONSOLE.log(f"step {step}: the lattice stays, where photographs ask for a finer one: {problem}")
+            if why and config.voxel_pixels:
+                CONSOLE.log(f"step {step}: the lattice stays, where photographs ask for a finer one: {why}")
                 finest = config.resolutions.index(max(model.grid.lattice.cell_shape))
                 known = config.resolutions[: finest + 1], config.refine_at[:finest]
                 model.config = replace(config, resolutions=known[0], refine_at=known[1])
