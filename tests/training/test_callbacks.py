@@ -217,7 +217,7 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
     assert model.grid.lattice.cell_shape == (8, 8, 8) and len(model.grid.voxels) == 8**3
 
 
-@pytest.mark.parametrize(("rays", "voxel_pixels", "side"), [(4096, 1.6, 16), (4095, 1.6, 8), (4095, 0.0, 16)])
+@pytest.mark.parametrize(("rays", "voxel_pixels", "side"), [(6144, 1.6, 16), (6143, 1.6, 8), (6143, 0.0, 16)])
 def test_a_refinement_for_which_rays_are_few_is_left_out_unless_somebody_asked_for_it(rays, voxel_pixels, side):
     """Of the last two steps each gives as many rays as 8^3 voxels of a surface need for a refinement by two."""
     model = model_of(resolutions=(8, 16), refine_at=(2,), prune_threshold=0.0, voxel_pixels=voxel_pixels)
