@@ -111,7 +111,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None
-        datamanager, config = attributes.pipeline.datamanager, model.config
+        datamanager: Any = attributes.pipeline.datamanager
+        config = model.config
         if step in decisions:
             decide_backdrop(model, datamanager)
         thin = step in config.thin_at
