@@ -107,7 +107,7 @@ def test_when_photographs_are_asked(scene, monkeypatch, wanted, steps, tracks, w
 
 
 def test_a_training_follows_depths(scene, capsys):
-    course = {"resolutions": [8, 16], "refine_at": [3], "photo_depth": "on"}
+    course = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [3], "photo_depth": "on"}
     followed = train(scene, 6, course).model
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("photographs agree about") == 1
@@ -133,6 +133,6 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr("thermoxels_ns.training.losses.feature_ray_loss", recorded)
-    course = {"resolutions": [8, 16], "refine_at": [4], "loss_overrides": {"backdrop": 0.0}}
+    course = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [4], "loss_overrides": {"backdrop": 0.0}}
     train(scene, 6, {**course, "photo_depth": depths})
     assert asked == [light] * 4 + [0.0] * 2
