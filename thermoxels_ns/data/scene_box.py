@@ -121,7 +121,7 @@ def exactness(error: FloatArray, photograph: IntArray) -> FloatArray:
 
     A point counts by the density that it stands for, one over the cube of its error, but at most 1, which is the weight
     of the photograph's point of median error. So what is far behind a scene, and wrong, hardly counts, and photographs
-    of a detail from near do not outweigh the others.
+    of a detail from near do not outweigh the others. The cube was chosen on one drawn street, with mirroring panes.
     """
     weight = np.ones(len(error))
     for number in np.unique(photograph):
