@@ -36,9 +36,10 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: ThermoxelsTrainer)
     quality: Quality | None = None
-    """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 128 along the longest side, 800
-    steps: a first look, a minute or two on two cores), standard (1.6 pixels, up to 256, 1500 steps, the default: one to
-    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures all three.
+    """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 192 along the longest side, 800
+    steps: a first look, a minute or two on two cores), standard (1.6 pixels, up to 384, fewer where rays are few, 1500
+    steps, the default: one to some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels
+    cost` measures all three.
     A quality replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions,
     refine-at, voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     show_settings: bool = False
