@@ -1,4 +1,5 @@
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,19 @@ def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, 
 def test_checkpoints_that_a_training_cannot_go_on_from(scene, checkpoints, tmp_path, options, message):
     with pytest.raises(CheckpointError, match=message):
         trainer(scene, tmp_path, *options, "--load-dir", str(checkpoints))
+
+
+@pytest.mark.parametrize("again", [DRAFT, ("--max-num-iterations", "300")])
+def test_what_was_found_for_a_scene_holds_when_its_training_goes_on(scene, tmp_path, again):
+    """A refinement was left out; the resolutions are still none that somebody typed, so later ones may be, too."""
+    made = trainer(scene, tmp_path, *DRAFT)
+    made.config.pipeline.model.voxel_pixels = 1.6
+    made.pipeline.model.config = replace(made.pipeline.model.config, resolutions=(32,), refine_at=())
+    made.save_found_settings()
+    made.save_checkpoint(499)
+    found = trainer(scene, tmp_path / "again", *again, "--load-dir", str(made.checkpoint_dir)).pipeline.model.config
+    assert found.resolutions == (32,) and found.refine_at == () and found.voxel_pixels == 1.6
+    assert found.suited_to(1000.0) == found, "photographs are not asked again"
 
 
 @pytest.mark.parametrize("steps", [10, 33, 400, 20_000])

@@ -89,7 +89,7 @@ class ThermoxelsModel(Model):
         bounds_c = torch.tensor([temperatures.min_c, temperatures.max_c], dtype=torch.float64)
         self.register_buffer("temperature_bounds_c", bounds_c)
         self.degrees_view = DegreesView(temperatures, self._read_ray) if self.has_temperatures else None
-        if 0.0 < voxel < math.inf:
+        if 0.0 < voxel < math.inf and not config.suited:
             pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
             CONSOLE.log(
                 f"voxels: {config.resolutions[-1]} along the longest side of the box, each {pixels:.1f} pixels wide "

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
+import tyro
 from nerfstudio.models.base_model import ModelConfig
 
 from thermoxels_ns.core.checks import check_ranges
@@ -81,6 +82,8 @@ class ThermoxelsModelConfig(ModelConfig):
     voxel_pixels: float = 0.0
     """Width of the finest voxels in pixels of the photographs, at the distance of most of what photographs show. Finer
     voxels follow noise, coarser voxels cannot hold the shape. 0: as resolutions says."""
+    suited: tyro.conf.Suppress[bool] = False
+    """Whether resolutions and steps are those found for the scene by `suited_to`, as in config.yml of a run."""
     refine_at: tuple[int, ...] = _STANDARD.refine_at
     """Steps at which the next resolution begins; one fewer than resolutions."""
     steps: int = _STANDARD.steps
@@ -209,10 +212,10 @@ class ThermoxelsModelConfig(ModelConfig):
         differs from `schedule_for`, all resolutions are scaled by one factor of at most `MOST_STRETCH`. Otherwise
         `schedule_for` gives all three for `voxels`, at most `MOST_VOXELS` times the last resolution and at most
         `FINEST` (or the last resolution, if that is more). Numbers are rounded, rather up: too few voxels lose shape
-        (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128). Infinite `voxels`, or a
-        `voxel_pixels` of 0, change nothing.
+        (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128). Infinite `voxels`, a
+        `voxel_pixels` of 0, and settings that are `suited` already change nothing.
         """
-        if not self.voxel_pixels or not math.isfinite(voxels):
+        if self.suited or not self.voxel_pixels or not math.isfinite(voxels):
             return self
         first, last = self.resolutions[0], self.resolutions[-1]
         usual, splits = schedule_for(last, self.steps), 0

@@ -154,15 +154,15 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             raise ThermoxelsError("device_type", expected=expected, got=self.machine.device_type, remedy=remedy)
 
     def follow_checkpoint(self) -> None:
-        """Take resolutions and schedules from the run that is resumed, unless they were typed or a quality is given."""
+        """Take resolutions and schedules from the run that is resumed, unless they or another quality were typed."""
         folder = self.load_dir or (self.load_checkpoint.parent if self.load_checkpoint else None)
-        if self.quality is not None or folder is None or not (folder.parent / "config.yml").is_file():
+        if folder is None or not (folder.parent / "config.yml").is_file():
             return
         earlier = yaml.load((folder.parent / "config.yml").read_text(encoding="utf-8"), Loader=ConfigLoader)
-        if not isinstance(earlier, ThermoxelsTrainerConfig):
+        if not isinstance(earlier, ThermoxelsTrainerConfig) or self.quality not in (None, earlier.quality):
             return
         if not any(typed_value(f"--pipeline.model.{item.replace('_', '-')}") for item in _SCHEDULE):
-            for item in _SCHEDULE:
+            for item in (*_SCHEDULE, "suited"):
                 setattr(self.pipeline.model, item, getattr(earlier.pipeline.model, item))
         for name, group in self.optimizers.items():
             before = earlier.optimizers.get(name, {}).get("scheduler")
@@ -204,7 +204,7 @@ class ThermoxelsTrainer(Trainer):
         kept: Any = deepcopy(self.config)
         pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
         model, parser = kept.pipeline.model, kept.pipeline.datamanager.dataparser
-        found, model.voxel_pixels = pipeline.model.config, 0.0
+        found, model.suited = pipeline.model.config, True
         model.resolutions, model.refine_at, model.prune_at = found.resolutions, found.refine_at, found.prune_at
         parser.scene_box = pipeline.datamanager.train_dataparser_outputs.metadata["input_box"]
         with plain_os_errors(self.base_dir), replace_when_done(self.base_dir / "config.yml") as path:
