@@ -18,12 +18,11 @@ from thermoxels_ns.fem.forms import (
     FixedNodes,
     FluxForm,
     RadiationForm,
-    SourceForm,
     at_time,
     effect_forms,
 )
 from thermoxels_ns.fem.linear_tets import lumped_mass
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, in_time
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -56,7 +55,7 @@ class HeatSystem:
         """Number of nodes, n: the mesh's nodes and, with quadratic tetrahedra, then the midpoints of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c)
         self._convection = tuple(form for form in forms if isinstance(form, ConvectionForm))
-        self._loads = tuple(form for form in forms if isinstance(form, (FluxForm, SourceForm)))
+        self._loads = tuple(form for form in forms if isinstance(form, FluxForm))
         self._radiation = tuple(form for form in forms if isinstance(form, RadiationForm))
         self._exchanging, self._every_form = (*self._convection, *self._loads, *self._radiation), forms
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
@@ -65,7 +64,7 @@ class HeatSystem:
         self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)  # Nodes whose temperature is given
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness matrix K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
-        self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
+        self.matrix_in_time: bool = any(in_time(form.quantities[0]) for form in self._convection)
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)  # True if there is radiation
         groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
@@ -127,7 +126,7 @@ class HeatSystem:
         return self._sum_of_loads(self._loads, self._loads_at, time_s)
 
     def _sum_of_loads(
-        self, forms: Sequence[ConvectionForm | FluxForm | SourceForm], kept: dict[float, Vector], time_s: float
+        self, forms: Sequence[ConvectionForm | FluxForm], kept: dict[float, Vector], time_s: float
     ) -> Vector:
         def add_up(at_s: float) -> Vector:
             return sum((form.load(at_s) for form in forms), np.zeros(self.num_nodes))
@@ -136,7 +135,8 @@ class HeatSystem:
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the load vector of radiation, the net heat into each node, shape (n,), [W]."""
-        return sum((form.load(relative_k, time_s) for form in self._radiation), np.zeros(self.num_nodes))
+        loads = (form.vector(form.flux_w_m2(relative_k, time_s)) for form in self._radiation)
+        return sum(loads, np.zeros(self.num_nodes))
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Return minus the Jacobian of `radiation_load`, shape (n, n), [W / K]."""
