@@ -28,11 +28,11 @@ _KEPT_TIMES = 4  # Number of times whose values `at_time` keeps; it is enough fo
 T = TypeVar("T")
 
 
-def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], most: int = _KEPT_TIMES) -> T:
-    """Return `compute(time_s)`, from the cache `kept` if it is there; the cache holds the last `most` values."""
+def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T]) -> T:
+    """Return `compute(time_s)`, from the cache `kept` if it is there; the cache holds the last values."""
     if time_s not in kept:
         value = compute(time_s)
-        while len(kept) >= most:
+        while len(kept) >= _KEPT_TIMES:
             del kept[next(iter(kept))]
         kept[time_s] = value
     return kept[time_s]
@@ -189,7 +189,6 @@ class FixedNodes:
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Numbers of the fixed nodes, ascending, shape (d,)."""
         self._num_nodes = num_nodes
-        self._kept: dict[float, Vector] = {}
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
@@ -213,9 +212,6 @@ class FixedNodes:
 
     def temperature_k(self, time_s: float) -> Vector:
         """Return the temperatures of `nodes` minus the reference, (d,), [K]; raise `HeatError` if effects disagree."""
-        return at_time(self._kept, time_s, self._temperature_k)
-
-    def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
         for number, form in enumerate(self._forms):
             place, wanted = np.searchsorted(self.nodes, form.nodes), form.surroundings_k(time_s)
@@ -232,7 +228,6 @@ class FixedNodes:
                     remedy="Let one effect fix all patches that meet, with a Varying that says what holds there.",
                 )
             known[place] = wanted
-        known.setflags(write=False)
         return known
 
 
