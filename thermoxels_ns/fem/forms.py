@@ -173,8 +173,6 @@ class FixedForm:
         self.nodes = np.unique(self.owners)
         points_m, self._temperature = space.points_m[self.nodes], effect.quantities[0]
         self._places = Places(points_m, np.zeros_like(points_m), space.selection.up)
-        self.area_m2: Vector = space.selection.facet_area_m2[parts]
-        """Area of each triangle, shape (k,), [m2]; triangles share a node's heat in proportion to it."""
 
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the given temperatures of `nodes` minus the reference, shape (len(nodes),), [K]."""
@@ -184,11 +182,10 @@ class FixedForm:
 class FixedNodes:
     """All d nodes whose temperature any effect fixes, and the shares of triangles in their heat."""
 
-    def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
-        self._forms = tuple(forms)
+    def __init__(self, forms: Sequence[FixedForm], space: Space) -> None:
+        self._forms, self._space = tuple(forms), space
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Numbers of the fixed nodes, ascending, shape (d,)."""
-        self._num_nodes = num_nodes
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
@@ -198,7 +195,8 @@ class FixedNodes:
             return sparse.csr_matrix((0, 0))
         owners = np.concatenate([form.owners for form in self._forms])
         column, width = np.searchsorted(self.nodes, owners.ravel()), owners.shape[1]
-        area = np.repeat(np.concatenate([form.area_m2 for form in self._forms]), width)
+        parts = np.concatenate([form.parts for form in self._forms])
+        area = np.repeat(self._space.selection.facet_area_m2[parts], width)
         share = area / np.bincount(column, area, len(self.nodes))[column]
         begins = width * np.arange(len(owners) + 1)
         return sparse.csr_matrix((share, column, begins), (len(owners), len(self.nodes)))
@@ -206,7 +204,7 @@ class FixedNodes:
     @cached_property
     def free(self) -> IntArray:
         """Numbers of the nodes that are not fixed, ascending."""
-        free = np.ones(self._num_nodes, dtype=bool)
+        free = np.ones(self._space.num_nodes, dtype=bool)
         free[self.nodes] = False
         return np.flatnonzero(free)
 

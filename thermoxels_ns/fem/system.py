@@ -59,7 +59,7 @@ class HeatSystem:
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
         """Forms of convection and radiation, whose heat flow depends on the temperature of the surface."""
         fixed = tuple(form for form in forms if isinstance(form, FixedForm))
-        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)  # Nodes whose temperature is given
+        self.fixed: FixedNodes = FixedNodes(fixed, self.space)  # Nodes whose temperature is given
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness matrix K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         self.matrix_in_time: bool = any(in_time(form.quantities[0]) for form in self._convection)
