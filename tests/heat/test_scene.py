@@ -193,9 +193,11 @@ def test_materials_by_region() -> None:
     brick, concrete = material("brick"), material("concrete")
     scene = HeatScene({"*": brick, "slab": concrete}, adiabatic=("*",))
     assert scene.problem(two).material == {"solid": brick, "slab": concrete}
-    # One material stays one, which is cheaper to assemble.
-    assert scene.problem(mesh).material == brick
-    assert HeatScene({"solid": brick, "slab": brick}, adiabatic=("*",)).problem(two).material == brick
+    assert scene.problem(mesh).materials == {"solid": brick}
+    assert HeatScene({"solid": brick, "slab": brick}, adiabatic=("*",)).problem(two).materials == {
+        "solid": brick,
+        "slab": brick,
+    }
     with pytest.raises(HeatError, match=r"materials: .* got 'roof'"):
         HeatScene({"roof": brick}, adiabatic=("*",)).problem(mesh)
     with pytest.raises(HeatError, match=r"materials: .* got none for solid"):

@@ -45,7 +45,7 @@ def scene(tmp_path: Path, text: str) -> HeatScene:
 def test_each_builds_a_problem_by_name_and_by_path(name: str) -> None:
     mesh, found = room(), load_heat_scene(name)
     problem = found.problem(mesh)
-    assert bool(problem.effects) == (name != "concrete") and problem.material == material("concrete")
+    assert bool(problem.effects) == (name != "concrete") and {*problem.materials.values()} == {material("concrete")}
     assert found.description
     np.testing.assert_array_equal(problem.start_c, mesh.temperature_c)
     again = load_heat_scene(str(configs_folder() / f"scene-{name}.yaml"))

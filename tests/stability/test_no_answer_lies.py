@@ -17,8 +17,8 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import MOST_UNBALANCED
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.solution import NOTHING
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.system import NOTHING
 from thermoxels_ns.fem.time_loop import BACKWARD_EULER, SDIRK2, solve_heat
 from thermoxels_ns.fem.tolerance import steady_error
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat

@@ -124,15 +124,8 @@ class Batch:
                 *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
                 *("--cores" if not self.executor else "--jobs", str(self.cores)),
                 # Retries are not in the Snakefile: a job of a cluster would repeat its stage within its own memory.
-                *(
-                    "--keep-going",
-                    "--rerun-incomplete",
-                    "--retries=1",
-                    "--rerun-triggers",
-                    "mtime",
-                    "params",
-                    "--nolock",
-                ),
+                *("--keep-going", "--rerun-incomplete", "--retries=1", "--nolock"),
+                *("--rerun-triggers", "mtime", "params"),
                 *(() if self.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * self.memory_gb)}")),
                 *(("--executor", self.executor) if self.executor else ()),
                 *(("--dry-run",) if self.dry_run else ("--quiet", "rules")),

@@ -153,7 +153,8 @@ def write_block(folder: Path, file: SceneFile, box: FloatArray, chosen: BoolArra
             frames.append(entry | _lens(frame.intrinsics))
     content: dict[str, Any] = {key: file.meta[key] for key in _KEPT if key in file.meta}
     for key in _SPLITS:
-        listed = [named[name] for name in map(_plain, file.meta.get(key, ())) if name in named]
+        names = (Path(str(name)).as_posix() for name in file.meta.get(key, ()))
+        listed = [named[name] for name in names if name in named]
         content |= {key: listed} if listed else {}
     folder.mkdir(parents=True, exist_ok=True)
     remove_file(folder / _BOUNDS)
@@ -166,7 +167,3 @@ def write_block(folder: Path, file: SceneFile, box: FloatArray, chosen: BoolArra
 
 def _lens(camera: Camera) -> dict[str, Any]:
     return camera.entries() | {"k3": camera.k3, "k4": camera.k4}
-
-
-def _plain(name: object) -> str:
-    return Path(str(name)).as_posix()

@@ -28,22 +28,22 @@ _KEPT_TIMES = 4  # Number of times whose values `at_time` keeps; it is enough fo
 T = TypeVar("T")
 
 
-def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], most: int = _KEPT_TIMES) -> T:
-    """Return `compute(time_s)`, from the cache `kept` if it is there; the cache holds the last `most` values."""
+def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T]) -> T:
+    """Return `compute(time_s)`, from the cache `kept` if it is there; the cache holds the last values."""
     if time_s not in kept:
         value = compute(time_s)
-        while len(kept) >= most:
+        while len(kept) >= _KEPT_TIMES:
             del kept[next(iter(kept))]
         kept[time_s] = value
     return kept[time_s]
 
 
-class _Boundary(ABC):
-    """The k boundary triangles on which an effect acts, and integrals over these triangles.
+class _Integrated(ABC):
+    """The k boundary triangles, or for a source tetrahedra, on which an effect acts, and integrals over these parts.
 
     The arguments `relative_k` are temperatures of all n unknowns minus `reference_c`, (n,), [K]; round-off is then
-    relative to differences. Heat flows of triangles are evaluated like the load, so that heat balances close. The
-    number q of integration points per triangle is 3 (the nodes) with linear tetrahedra.
+    relative to differences. Heat flows of parts are evaluated like the load, so that heat balances close. The number q
+    of integration points per triangle is 3 (the nodes) with linear tetrahedra. Heat of a source is per volume.
     """
 
     def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:
@@ -51,39 +51,39 @@ class _Boundary(ABC):
         self.quantities = effect.quantities
         self.load_in_time = any(map(in_time, self.quantities))
         """True if the heat flow changes with time at constant temperatures of the body."""
-        self.nodes = space.facet_nodes(parts)
-        self._numbers, self._space = self.nodes.T.ravel(), space
-        self._shapes, self._area_m2 = space.facet_rule(parts)
-        self.places = space.selection.facet_places(parts)
+        source = effect.form == "source"
+        self.nodes, self._shapes, self._sizes, self.places = (space.tet_rule if source else space.facet_rule)(parts)
+        self._numbers, self._num_nodes = self.nodes.T.ravel(), space.num_nodes
+        self._lumped = space.order == 1 and not source  # the integration points are the nodes
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
-        """Return entry `number` of `Effect.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
+        """Return entry `number` of `Effect.quantities` at `places`: centroids of triangles, (k, 1), or (k, q)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
         time_s = time_s if in_time(quantity) else 0.0
-        return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t)[:, None])
+        return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t).reshape(len(self.parts), -1))
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Return the temperatures at the integration points, minus the reference, shape (k, q), [K]."""
         nodal = relative_k[self.nodes]
-        return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
+        return nodal if self._lumped else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Return the load vector integral(f phi_i), shape (n,), [W], of a flux f of shape (k, q) or (k, 1)."""
-        heat_w = flux_w_m2 * self._area_m2
-        shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
-        return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
+        heat_w = flux_w_m2 * self._sizes
+        shares = heat_w.T if self._lumped else np.einsum("kq,aq->ak", heat_w, self._shapes)
+        return sums_by_number(self._numbers, shares.ravel(), self._num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
         """Return the boundary matrix integral(h phi_i phi_j), (n, n), [W / K], for h of shape (k, q) or (k, 1). It is
         lumped, thus diagonal, for linear tetrahedra."""
-        if self._space.order == 1:
+        if self._lumped:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
-            local = np.einsum("kq,aq,bq->kab", coefficient_w_m2k * self._area_m2, self._shapes, self._shapes)
+            local = np.einsum("kq,aq,bq->kab", coefficient_w_m2k * self._sizes, self._shapes, self._shapes)
             rows, columns = np.broadcast_arrays(self.nodes[:, :, None], self.nodes[:, None, :])
             entries = local.ravel(), (rows.ravel(), columns.ravel())
-            matrix = sparse.csr_matrix(entries, shape=(self._space.num_nodes,) * 2)
+            matrix = sparse.csr_matrix(entries, shape=(self._num_nodes,) * 2)
         matrix.eliminate_zeros()
         return matrix
 
@@ -92,11 +92,11 @@ class _Boundary(ABC):
         """Return the heat flux into the body, [W / m2], at the integration points (k, q), or per triangle (k, 1)."""
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body through each triangle, shape (k,), [W]."""
-        return (self.flux_w_m2(relative_k, time_s) * self._area_m2).sum(axis=1)
+        """Return the heat flow into the body through each triangle, or released in each tetrahedron, (k,), [W]."""
+        return (self.flux_w_m2(relative_k, time_s) * self._sizes).sum(axis=1)
 
 
-class _Exchange(_Boundary):
+class _Exchange(_Integrated):
     """Exchange of heat with surroundings. Entry 1 of `Effect.quantities` is the temperature of the surroundings."""
 
     def strength(self, time_s: float) -> Vector:
@@ -111,11 +111,6 @@ class _Exchange(_Boundary):
 class ConvectionForm(_Exchange):
     """Convection or ground contact, a Robin boundary condition with the flux h (T_ambient - T): a matrix and a load."""
 
-    @property
-    def matrix_in_time(self) -> bool:
-        """True if h, and with it the matrix, changes with time."""
-        return in_time(self.quantities[0])
-
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
         """Return the Robin boundary matrix integral(h phi_i phi_j), (n, n), [W / K]; lumped for linear tetrahedra."""
         return self.matrix(self.strength(time_s))
@@ -129,38 +124,16 @@ class ConvectionForm(_Exchange):
         return self.strength(time_s) * (self.surroundings_k(time_s) - self.surface_k(relative_k))
 
 
-class FluxForm(_Boundary):
-    """A given heat flux f into the body, the product of the effect's quantities: a load."""
+class FluxForm(_Integrated):
+    """A given heat flux f into the body, or source per volume, the product of the effect's quantities: a load."""
 
     def load(self, time_s: float) -> Vector:
         """Return the load integral(f phi_i), shape (n,), [W]."""
         return self.vector(self.flux_w_m2(np.zeros(0), time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the flux f into the body, shape (k, 1), [W / m2]; `relative_k` has no influence."""
+        """Return the flux f into the body, (k, 1), [W / m2], or a source, (k, q), [W / m3]; `relative_k` is unused."""
         return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
-
-
-class SourceForm:
-    """A given heat source s, [W / m3], in k tetrahedra: a load."""
-
-    def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, _: float) -> None:
-        self.effect, self.kind, self.parts, self._space = label, effect.form, parts, space
-        self._source = effect.quantities[0]
-        self._places, self._volumes = space.source_points(parts)
-        self.load_in_time = in_time(self._source)
-
-    def load(self, time_s: float) -> Vector:
-        """Return the load integral(s phi_i), shape (n,), [W]."""
-        return self._space.source_load(self.parts, self._point_w(time_s))
-
-    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat released in each tetrahedron, shape (k,), [W]; `relative_k` has no influence."""
-        return self._point_w(time_s).reshape(len(self.parts), -1).sum(axis=1)
-
-    def _point_w(self, time_s: float) -> Vector:
-        """Return the heat released at each of the `Space.source_points`, shape (k q,), [W]."""
-        return values_at(self._source, self._places, time_s) * self._volumes
 
 
 class RadiationForm(_Exchange):
@@ -173,10 +146,6 @@ class RadiationForm(_Exchange):
     def strength(self, time_s: float) -> Vector:
         """Return sigma eps per triangle, [W / (m2 K4)], shape (k, 1)."""
         return self.at(2, time_s) * self.at(0, time_s)
-
-    def load(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the load integral(sigma eps (T_s^4 - T^4) phi_i), shape (n,), [W]."""
-        return self.vector(self.flux_w_m2(relative_k, time_s))
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Return minus the Jacobian of the load, integral(4 sigma eps |T|^3 phi_i phi_j), shape (n, n), [W / K]. T is
@@ -204,8 +173,6 @@ class FixedForm:
         self.nodes = np.unique(self.owners)
         points_m, self._temperature = space.points_m[self.nodes], effect.quantities[0]
         self._places = Places(points_m, np.zeros_like(points_m), space.selection.up)
-        self.area_m2: Vector = space.selection.facet_area_m2[parts]
-        """Area of each triangle, shape (k,), [m2]; triangles share a node's heat in proportion to it."""
 
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the given temperatures of `nodes` minus the reference, shape (len(nodes),), [K]."""
@@ -215,12 +182,10 @@ class FixedForm:
 class FixedNodes:
     """All d nodes whose temperature any effect fixes, and the shares of triangles in their heat."""
 
-    def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
-        self._forms = tuple(forms)
+    def __init__(self, forms: Sequence[FixedForm], space: Space) -> None:
+        self._forms, self._space = tuple(forms), space
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Numbers of the fixed nodes, ascending, shape (d,)."""
-        self._num_nodes = num_nodes
-        self._kept: dict[float, Vector] = {}
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
@@ -230,7 +195,8 @@ class FixedNodes:
             return sparse.csr_matrix((0, 0))
         owners = np.concatenate([form.owners for form in self._forms])
         column, width = np.searchsorted(self.nodes, owners.ravel()), owners.shape[1]
-        area = np.repeat(np.concatenate([form.area_m2 for form in self._forms]), width)
+        parts = np.concatenate([form.parts for form in self._forms])
+        area = np.repeat(self._space.selection.facet_area_m2[parts], width)
         share = area / np.bincount(column, area, len(self.nodes))[column]
         begins = width * np.arange(len(owners) + 1)
         return sparse.csr_matrix((share, column, begins), (len(owners), len(self.nodes)))
@@ -238,15 +204,12 @@ class FixedNodes:
     @cached_property
     def free(self) -> IntArray:
         """Numbers of the nodes that are not fixed, ascending."""
-        free = np.ones(self._num_nodes, dtype=bool)
+        free = np.ones(self._space.num_nodes, dtype=bool)
         free[self.nodes] = False
         return np.flatnonzero(free)
 
     def temperature_k(self, time_s: float) -> Vector:
         """Return the temperatures of `nodes` minus the reference, (d,), [K]; raise `HeatError` if effects disagree."""
-        return at_time(self._kept, time_s, self._temperature_k)
-
-    def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
         for number, form in enumerate(self._forms):
             place, wanted = np.searchsorted(self.nodes, form.nodes), form.surroundings_k(time_s)
@@ -263,15 +226,14 @@ class FixedNodes:
                     remedy="Let one effect fix all patches that meet, with a Varying that says what holds there.",
                 )
             known[place] = wanted
-        known.setflags(write=False)
         return known
 
 
-Form: TypeAlias = ConvectionForm | FluxForm | SourceForm | RadiationForm | FixedForm
+Form: TypeAlias = ConvectionForm | FluxForm | RadiationForm | FixedForm
 _FORMS: dict[str, type[Form]] = {
     "convection": ConvectionForm,
     "flux": FluxForm,
-    "source": SourceForm,
+    "source": FluxForm,
     "radiation": RadiationForm,
     "fixed": FixedForm,
 }

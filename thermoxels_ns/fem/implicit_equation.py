@@ -34,8 +34,7 @@ _SETTLED = 1e-5
 """Largest change in a Newton step, as a share of the absolute temperature, after which the method may end. The error
 that is left is about the square of this share."""
 _SHORT_OF_LEAST = 0.1  # Relative error of the step length that the line search finds
-_EPS = float(np.finfo(np.float64).eps)
-_ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of absolute values
+_ROUND_OFF = 8.0 * float(np.finfo(np.float64).eps)  # Round-off of a sum as a share of the sum of absolute values
 PATIENCE = 1500
 """Largest number of iterations with the diagonal as preconditioner; multigrid then continues from the same x. Multigrid
 is slow to set up, but its number of iterations hardly depends on the mesh size, flat cells or contrasts."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -59,17 +58,16 @@ class HeatSolution:
     differences, sum m_i |T_i - mean T|, plus all heat exchanged."""
     status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
-    effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
-    newton_iterations: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
-    steps: int = 0  # Number of steps
-    time_error_k: float = math.nan
+    effects: tuple[EffectHeat, ...]  # Heat that each effect of the problem brought, in the order of the problem
+    newton_iterations: IntArray  # Steps of Newton's method in each interval, shape (s,); all 0 without radiation
+    steps: int  # Number of steps
+    time_error_k: float
     """Estimated largest error of any temperature due to the time steps, [K]. Adaptive steps: the sum of their
     estimates. Equal steps: from a solution with steps twice as long, or NaN if it was not asked for."""
-    unbalanced_w: float = 0.0  # Largest heat that a step left unbalanced, summed over all nodes, plus round-off, [W]
-    overshoot_k: float = 0.0
+    unbalanced_w: float  # Largest heat that a step left unbalanced, summed over all nodes, plus round-off, [W]
+    overshoot_k: float
     """Largest distance of a temperature outside the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
-    facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
+    facet_heat_w: FloatArray
     """Heat flow into the body through each triangle at the end, (f,), [W], as if fixed nodes stored no heat."""
 
 
@@ -84,35 +82,19 @@ class SteadySolution:
     status: str  # Sentences on how the iterations converged
     iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
-    edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
+    edge_temperature_c: FloatArray
     """Temperatures at midpoints of edges, in the order of `mesh_edges`, (e,), [degrees Celsius]; empty if linear."""
-    unbalanced_w: float = 0.0
+    unbalanced_w: float
     """Unbalanced heat summed over all nodes, plus round-off, [W]; no heat flow is more uncertain than this."""
-    overshoot_k: float = 0.0  # Largest distance of a temperature outside the surroundings' range, [K]; 0 up to 0.01 K
-    facet_heat_w: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """Heat flow into the body through each boundary triangle, shape (f,), [W]."""
+    overshoot_k: float  # Largest distance of a temperature outside the surroundings' range, [K]; 0 up to 0.01 K
+    facet_heat_w: FloatArray  # Heat flow into the body through each boundary triangle, shape (f,), [W]
     error: ErrorSize | None = None  # Errors due to the mesh, as `tolerance.steady_error` estimates them, if it did
-
-
-def heat_by_effect(
-    effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: FloatArray
-) -> tuple[EffectHeat, ...]:
-    """Return heat flows by effect, in the order of the labels `effects`. `group_heat_w` (s, g), [W], has a column per
-    group; `groups` has an effect's label and a patch or region per column."""
-    columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
-    for number, (owner, name) in enumerate(groups):
-        columns[owner].append((number, name))
-    found = []
-    for effect, chosen in columns.items():
-        heat_w = group_heat_w[:, [number for number, _ in chosen]]
-        found.append(EffectHeat(effect, heat_w.sum(axis=1), tuple(name for _, name in chosen), heat_w))
-    return tuple(found)
 
 
 Solution: TypeAlias = HeatSolution | SteadySolution  # A solution through time or of a steady state
 
 _CHILD_FACETS = 4  # Triangles into which `refine_mesh` cuts a triangle
-_EQUAL = 1e-9  # Temperatures that differ by at most this share of the absolute temperature count as equal
+NOTHING = 1e-9  # Temperatures that differ by at most this share of the absolute temperature count as equal
 
 
 def mean_flows_w(solution: Solution) -> dict[str, float]:
@@ -124,7 +106,7 @@ def mean_flows_w(solution: Solution) -> dict[str, float]:
 def share_of_heat(heat_w: float, solution: Solution) -> float:
     """Return `heat_w` divided by the mean heat that flows through the body; 0 if all temperatures are equal."""
     level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
-    if heat_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
+    if heat_w == 0.0 or float(np.ptp(solution.temperature_c)) <= NOTHING * level_k:
         return 0.0
     through_w = 0.5 * sum(map(abs, mean_flows_w(solution).values()))
     return heat_w / through_w if through_w > 0.0 else math.inf

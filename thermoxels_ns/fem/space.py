@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet
+from skfem.element import ElementH1
 from skfem.helpers import dot
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
@@ -117,33 +118,34 @@ class Space:
         del data, rows, columns
         return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
-    def facet_rule(self, facets: Numbers) -> tuple[Vector, Vector]:
-        """Return the m shape functions at the q integration points, (m, q), and weights of the points, (k, q), [m2].
-        The weights of a triangle add up to its area. `facets` (k,) are numbers of boundary triangles."""
+    def facet_rule(self, facets: Numbers) -> tuple[Numbers, Vector, Vector, Places]:
+        """Return how to integrate over k boundary triangles with the numbers `facets`, (k,), with q points in each.
+
+        The result is the m unknowns of each, (k, m), the m shape functions at the points, (m, q), the points' weights,
+        (k, q), [m2], which add up to a triangle's area, and the k centroids, at which quantities are evaluated.
+        """
         points, weights = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
-        shapes = np.stack([element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(3 * self.order)])
-        return shapes, 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
+        sizes = 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
+        shapes = _shapes(element, points, 3 * self.order)
+        return self.facet_nodes(facets), shapes, sizes, self.selection.facet_places(facets)
 
-    def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
-        """Return the integration points of sources, q per tetrahedron, and their weights, shape (k q,), [m3].
+    def tet_rule(self, tets: Numbers) -> tuple[Numbers, Vector, Vector, Places]:
+        """Return how to integrate sources over k tetrahedra, exactly for polynomials of degree `order`.
 
-        `tets` (k,) are numbers of tetrahedra. Integrals are exact for polynomials of degree `order`.
+        The result is as in `facet_rule` with weights in [m3], but the places are all k q integration points.
         """
-        (points, weights), mesh = get_quadrature(RefTet, self.order), self.selection.mesh
+        (points, weights), mesh, nodes = get_quadrature(RefTet, self.order), self.selection.mesh, self.tet_nodes()[tets]
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
-        corners = mesh.points_m[mesh.tets[tets]]
-        places = np.einsum("aq,tai->tqi", barycentric, corners).reshape(-1, 3)
-        volumes = (6.0 * signed_volumes(mesh.points_m, mesh.tets[tets])[:, None] * weights).ravel()
-        return Places(places, np.zeros_like(places), self.selection.up), volumes
+        places = np.einsum("aq,tai->tqi", barycentric, mesh.points_m[mesh.tets[tets]]).reshape(-1, 3)
+        sizes = 6.0 * signed_volumes(mesh.points_m, mesh.tets[tets])[:, None] * weights
+        shapes = _shapes(self.element, points, nodes.shape[1])
+        return nodes, shapes, sizes, Places(places, np.zeros_like(places), self.selection.up)
 
-    def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
-        """Return the load vector, (n,), [W], of the heat `point_w` (k q,), [W], released at the `source_points`."""
-        points, weights = get_quadrature(RefTet, self.order)
-        nodes = self.tet_nodes()[tets].T
-        shapes = np.stack([self.element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(len(nodes))])
-        shares = np.einsum("tq,aq->at", point_w.reshape(-1, len(weights)), shapes)
-        return sums_by_number(nodes.ravel(), shares.ravel(), self.num_nodes)
+
+def _shapes(element: ElementH1, points: Vector, count: int) -> Vector:
+    """Return the first `count` shape functions of an element at q points of the reference cell, shape (count, q)."""
+    return np.stack([element.lbasis(points, i)[0] * np.ones(points.shape[1]) for i in range(count)])
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:

@@ -9,8 +9,8 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
-from thermoxels_ns.fem.problem import HeatProblem, effect_labels
-from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.system import Engine, HeatSystem
 
 Vector = FloatArray
@@ -54,7 +54,7 @@ def solve_steady(
     overshoot_k, overshoot = out_of_range(max(low - float(relative_k.min()), float(relative_k.max()) - high))
     return SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
-        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
+        effects=system.heat_of_effects(group_heat[None]),
         energy_residual=0.5 * abs(float(group_heat.sum())) / flows_w if flows_w > 0.0 else 0.0,
         status=f"The steady state was found. {solution.status}{overshoot}",
         iterations=solution.iterations,

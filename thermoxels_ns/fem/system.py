@@ -18,12 +18,12 @@ from thermoxels_ns.fem.forms import (
     FixedNodes,
     FluxForm,
     RadiationForm,
-    SourceForm,
     at_time,
     effect_forms,
 )
 from thermoxels_ns.fem.linear_tets import lumped_mass
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, effect_labels, in_time
+from thermoxels_ns.fem.solution import NOTHING, EffectHeat
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -31,9 +31,6 @@ Vector = FloatArray
 MOST_TIMES_CONDUCTION = 1e10
 """Largest ratio of a node's convection to its conduction (diagonals of R and K). Above it, the surface practically has
 the temperature of the air, and their difference would be lost to round-off."""
-NOTHING = 1e-9  # Temperatures count as equal if they differ by less than this share of the absolute temperature
-_LEAST = float(np.finfo(np.float64).tiny)
-_KEPT_RANGES = 64  # Number of times for which the range of the surroundings is kept
 
 
 class HeatSystem:
@@ -56,16 +53,16 @@ class HeatSystem:
         """Number of nodes, n: the mesh's nodes and, with quadratic tetrahedra, then the midpoints of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c)
         self._convection = tuple(form for form in forms if isinstance(form, ConvectionForm))
-        self._loads = tuple(form for form in forms if isinstance(form, (FluxForm, SourceForm)))
+        self._loads = tuple(form for form in forms if isinstance(form, FluxForm))
         self._radiation = tuple(form for form in forms if isinstance(form, RadiationForm))
         self._exchanging, self._every_form = (*self._convection, *self._loads, *self._radiation), forms
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
         """Forms of convection and radiation, whose heat flow depends on the temperature of the surface."""
         fixed = tuple(form for form in forms if isinstance(form, FixedForm))
-        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)  # Nodes whose temperature is given
+        self.fixed: FixedNodes = FixedNodes(fixed, self.space)  # Nodes whose temperature is given
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness matrix K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
-        self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
+        self.matrix_in_time: bool = any(in_time(form.quantities[0]) for form in self._convection)
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)  # True if there is radiation
         groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
@@ -82,7 +79,6 @@ class HeatSystem:
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
         self._loads_at: dict[float, Vector] = {}
         self._ambient_at: dict[float, Vector] = {}
-        self._ranges_at: dict[float, tuple[float, float]] = {}
 
     @property
     def start_k(self) -> Vector:
@@ -107,7 +103,7 @@ class HeatSystem:
             return None
         matrices = (form.convection_matrix(time_s) for form in self._convection)
         total = sum(matrices, sparse.csr_matrix(self.stiffness.shape))
-        most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), _LEAST)))
+        most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), np.finfo(np.float64).tiny)))
         if not most <= MOST_TIMES_CONDUCTION:
             remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
             expected = f"at most {MOST_TIMES_CONDUCTION:g} times as much heat per kelvin as the cells behind conduct"
@@ -122,12 +118,8 @@ class HeatSystem:
             return matrix
         return sparse.csr_matrix(matrix + sparse.diags(self.nodal_mass_j_k / step_s, format="csr"))
 
-    def load(self, time_s: float) -> Vector:
-        """Return the load vector of fluxes and sources, (n,), [W]; convection's h T_ambient is not included."""
-        return self._sum_of_loads(self._loads, self._loads_at, time_s)
-
     def _sum_of_loads(
-        self, forms: Sequence[ConvectionForm | FluxForm | SourceForm], kept: dict[float, Vector], time_s: float
+        self, forms: Sequence[ConvectionForm | FluxForm], kept: dict[float, Vector], time_s: float
     ) -> Vector:
         def add_up(at_s: float) -> Vector:
             return sum((form.load(at_s) for form in forms), np.zeros(self.num_nodes))
@@ -136,7 +128,8 @@ class HeatSystem:
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the load vector of radiation, the net heat into each node, shape (n,), [W]."""
-        return sum((form.load(relative_k, time_s) for form in self._radiation), np.zeros(self.num_nodes))
+        loads = (form.vector(form.flux_w_m2(relative_k, time_s)) for form in self._radiation)
+        return sum(loads, np.zeros(self.num_nodes))
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Return minus the Jacobian of `radiation_load`, shape (n, n), [W / K]."""
@@ -144,8 +137,8 @@ class HeatSystem:
         return sum(slopes, sparse.csr_matrix(self.stiffness.shape))
 
     def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:
-        """Return the heat into each node, (n,), [W], from `load`, then from convection and from radiation if any."""
-        parts, convection = [self.load(time_s)], self.convection_matrix(time_s)
+        """Return the heat into each node, (n,), [W], from fluxes and sources, then convection and radiation if any."""
+        parts, convection = [self._sum_of_loads(self._loads, self._loads_at, time_s)], self.convection_matrix(time_s)
         if convection is not None:
             parts.append(self._sum_of_loads(self._convection, self._ambient_at, time_s) - convection @ relative_k)
         if self.nonlinear:
@@ -189,6 +182,15 @@ class HeatSystem:
         """Return the sum over each entry of `groups`, (g,), [W], of heat flows in the order of `every_part_heat_w`."""
         return sums_by_number(self._group[: len(heat_w)], heat_w, len(self.groups))
 
+    def heat_of_effects(self, group_heat_w: Vector) -> tuple[EffectHeat, ...]:
+        """Return heat flows by effect, in the order of the problem, from those of `groups`, (s, g), [W]."""
+        found = []
+        for effect in effect_labels(self.problem):
+            chosen = [number for number, (owner, _) in enumerate(self.groups) if owner == effect]
+            heat_w, names = group_heat_w[:, chosen], tuple(self.groups[number][1] for number in chosen)
+            found.append(EffectHeat(effect, heat_w.sum(axis=1), names, heat_w))
+        return tuple(found)
+
     def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat into the body through each boundary triangle, as if fixed nodes stored no heat, (f,), [W]."""
         total_w = np.zeros(len(self.problem.mesh.facets))
@@ -208,9 +210,6 @@ class HeatSystem:
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
         """Return the lowest and highest temperature around the body minus the reference, [K]. The lowest is -inf if a
         flux or source cools the body, the highest is inf if one heats it."""
-        return at_time(self._ranges_at, time_s, self._surroundings_k, most=_KEPT_RANGES)
-
-    def _surroundings_k(self, time_s: float) -> tuple[float, float]:
         low, high = np.inf, -np.inf
         ambients = [form.surroundings_k(time_s) for form in self.surface_forms]
         ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []

@@ -13,8 +13,8 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import out_of_range, refuse_too_cold
 from thermoxels_ns.fem.system import Engine, HeatSystem
 
@@ -130,8 +130,6 @@ class RungeKutta:
         """Return the mean heat flow in a step of each of `HeatSystem.groups`, (g,), [W], from the stages' `states`. The
         heat of fixed nodes is what balances their storage and all other flows."""
         system, scheme, fixed = self.system, self._scheme, self.system.fixed
-        if not system.groups:
-            return np.zeros(0)
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
         parts_w: Vector | float = 0.0
         for weight, node, state in zip(scheme.weights[-1], scheme.nodes, states):
@@ -267,7 +265,8 @@ def _adaptive_steps(balance: HeatBalance, time: AdaptiveSteps, relative_toleranc
     for end_s in time.times_s[1:].tolist():
         while now_s < end_s:
             left_s = end_s - now_s
-            step_s = _fitted(min(wished_s, system.problem.resolution_s), left_s)
+            step_s = min(wished_s, system.problem.resolution_s)
+            step_s = left_s if step_s >= left_s else min(step_s, 0.5 * left_s)  # at most half of what is not the last
             try:
                 step = kutta.step(relative_k, now_s, step_s, estimate=True)
                 error_k, why = step.error_k, f"keeps within {time.tolerance_k:g} K. Something jumps in time: end an"
@@ -354,7 +353,7 @@ class HeatBalance:
             energy_residual=unexplained / scale,
             status=f"All {self.steps} steps converged.{repeated}{overshoot}",
             iterations=self._iterations[:, 0],
-            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
+            effects=system.heat_of_effects(heat_j / lengths[:, None]),
             newton_iterations=self._iterations[:, 1],
             steps=self.steps,
             time_error_k=self._error_k,
@@ -362,12 +361,3 @@ class HeatBalance:
             facet_heat_w=facet_heat_w,
             overshoot_k=overshoot_k,
         )
-
-
-def _fitted(wished_s: float, left_s: float) -> float:
-    """Return the length of the next step, [s]: `left_s` if `wished_s` reaches the interval's end, else at most half.
-
-    >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
-    [10.0, 5.0, 3.0]
-    """
-    return left_s if wished_s >= left_s else min(wished_s, 0.5 * left_s)

@@ -9,16 +9,15 @@ from pydantic import Field
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import record
-from thermoxels_ns.fem.problem import Effect, Quantity, Varying
+from thermoxels_ns.fem.problem import Effect, Positive, Quantity, Text, Varying
 
 HOTTEST_C = 10_000.0
 """Highest accepted temperature, [degrees Celsius]; a higher one is a wrong unit, as the sun's surface has 5500."""
 
 Celsius: TypeAlias = Annotated[float, Field(ge=-ZERO_CELSIUS_K, le=HOTTEST_C)]
 AtLeastZero: TypeAlias = Annotated[float, Field(ge=0.0)]
-AboveZero: TypeAlias = Annotated[float, Field(gt=0.0)]
 Fraction: TypeAlias = Annotated[float, Field(ge=0.0, le=1.0)]
-Names: TypeAlias = Annotated[tuple[Annotated[str, Field(pattern=r"\S")], ...], Field(min_length=1)]
+Names: TypeAlias = Annotated[tuple[Text, ...], Field(min_length=1)]
 
 
 @record(HeatError)
@@ -73,7 +72,7 @@ class Radiation(SurfaceEffect):
     emissivity: Fraction | Varying
     """Emissivity of the surface, multiplied by the view factor if the surroundings do not fill its view; 0 to 1."""
     surroundings_c: Celsius | Varying  # Radiant temperature of the surroundings, [degrees Celsius], at least -273.15
-    stefan_boltzmann_w_m2k4: AboveZero = STEFAN_BOLTZMANN_W_M2K4
+    stefan_boltzmann_w_m2k4: Positive = STEFAN_BOLTZMANN_W_M2K4
     """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is from CODATA 2018. Published benchmarks use 5.67e-8."""
 
     kind = "radiation"
@@ -95,7 +94,7 @@ class AbsorbedSolar(SurfaceEffect):
 class GroundContact(SurfaceEffect):
     """Heat exchange with the ground through a thermal resistance R, k grad T . n = (T_ground - T) / R."""
 
-    resistance_m2k_w: AboveZero  # Thermal resistance between the surface and the undisturbed ground, [m2 K / W]
+    resistance_m2k_w: Positive  # Thermal resistance between the surface and the undisturbed ground, [m2 K / W]
     ground_c: Celsius | Varying  # Temperature of the undisturbed ground, [degrees Celsius], at least -273.15
 
     kind = "ground contact"

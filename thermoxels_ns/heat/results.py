@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
@@ -121,12 +120,6 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
 def region_behind_facets(mesh: TetMesh) -> IntArray:
     """Return the region behind each boundary triangle, as an index into `mesh.region_names`, shape (f,)."""
     return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
-
-
-def volume_shares(mesh: TetMesh) -> FloatArray:
-    """Return each node's share of the body's volume, (n,), with sum 1; a tetrahedron is shared equally by its nodes."""
-    weights = lumped_mass(mesh.points_m, mesh.tets, np.ones(len(mesh.tets)))
-    return weights / weights.sum()
 
 
 def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> Spot:

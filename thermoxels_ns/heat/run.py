@@ -17,6 +17,7 @@ from thermoxels_ns.core.checks import check_array
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.core.units import kelvin_to_celsius
+from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem, Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
@@ -29,7 +30,6 @@ from thermoxels_ns.heat.results import (
     heat_results,
     matching_facets,
     region_behind_facets,
-    volume_shares,
     wall_of_scene,
 )
 from thermoxels_ns.heat.scene import HeatScene
@@ -188,6 +188,7 @@ def run_scene(
     wall = wall_of_scene(scene, solved, solution, nodes, doubtful=bool(about_patches))
     probes = place_probes(nodes.mesh, points_m)
     results = heat_results(solved, solution, nodes)
+    node_m3 = lumped_mass(nodes.mesh.points_m, nodes.mesh.tets, np.ones(len(nodes.mesh.tets)))  # tetrahedra, shared out
     return HeatRun(
         scene=scene,
         problem=problem,
@@ -202,7 +203,7 @@ def run_scene(
         results=results,
         wall=None if isinstance(wall, str) else wall,
         no_wall=wall if isinstance(wall, str) else "",
-        mean_c=nodes.states_c @ volume_shares(nodes.mesh),
+        mean_c=nodes.states_c @ (node_m3 / node_m3.sum()),
         probes_m=points_m,
         probes_c=np.stack([probes @ state_c for state_c in nodes.states_c]),
         seconds={**seconds, "answers": clock.perf_counter() - done},
@@ -248,7 +249,7 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
         return ()
     inside = matching_facets(selection, inside_air.patches)
     area, whole = selection.facet_area_m2[inside], float(selection.facet_area_m2[inside].sum())
-    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    level = selection.facet_normal[inside] @ np.array(selection.up)
     if float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * whole:  # walls and floors of rooms
         return ()
     return (
@@ -278,8 +279,7 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
             f"({x:.4g}, {y:.4g}, {z:.4g}) m: rims of holes, or walls that end. There both airs touch the body; "
             "temperature factors leave these nodes out, heat losses do not."
         )
-    area = selection.facet_area_m2
-    level = selection.facet_normal @ np.array(selection.up) / np.linalg.norm(selection.up)
+    area, level = selection.facet_area_m2, selection.facet_normal @ np.array(selection.up)
     # A floor may be adiabatic, or touch a cellar: all that faces up and is not outside is one.
     floor = float(area[(level > _COS_45) & ~outside].sum())
     ceiling = float(area[inside & (level < -_COS_45)].sum())
@@ -332,8 +332,7 @@ def with_layers(
     film = inside.convection().coefficient_w_m2k
     film = np.broadcast_to(film.function(places, 0.0) if isinstance(film, Varying) else film, len(inner))
     made_of = scene.material(mesh)
-    by_name = made_of if isinstance(made_of, dict) else dict.fromkeys(mesh.region_names, made_of)
-    conductivity = np.array([by_name[n].conductivity_w_mk if n in by_name else np.nan for n in mesh.region_names])
+    conductivity = np.array([made_of[n].conductivity_w_mk if n in made_of else np.nan for n in mesh.region_names])
     conducts = 1.0 / (1.0 / film[nearest] + thickness_m / conductivity[region_behind_facets(mesh)[outer]])
     air, layers, effects = outside.convection(), [], []
     assert isinstance(air.coefficient_w_m2k, float), "outside, films are numbers"

@@ -180,11 +180,8 @@ class HeatScene:
 
     def _named_effects(self, selection: Selection) -> list[tuple[str, Effect]]:
         """Return pairs of an entry's name in the scene and an effect on the surface that it causes."""
-        named: list[tuple[str, Effect]] = []
-        if self.inside_air is not None:
-            named.append(("inside_air", self.inside_air.convection()))
-        if self.outside_air is not None:
-            named.append(("outside_air", self.outside_air.convection()))
+        airs = ("inside_air", self.inside_air), ("outside_air", self.outside_air)
+        named: list[tuple[str, Effect]] = [(name, air.convection()) for name, air in airs if air is not None]
         named += [("sky and ground", effect) for effect in self._sky_and_ground(selection)]
         named += [("sun", effect) for effect in self._sunlight(selection)]
         for key in (field.name for field in fields(self) if field.name != "internal_heat"):
@@ -194,14 +191,13 @@ class HeatScene:
                 named += [(entry_name, entry) for entry_name, entry in listed if isinstance(entry, Effect)]
         return named
 
-    def material(self, mesh: TetMesh) -> Material | dict[str, Material]:
-        """Return the material of a mesh, or a mapping by region if regions differ; it may lack regions."""
+    def material(self, mesh: TetMesh) -> dict[str, Material]:
+        """Return the material of each region of a mesh by name; regions that no pattern matches are missing."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
             matching = chosen_names("materials", mesh.region_names, (pattern,), "regions")
             chosen |= dict.fromkeys(matching, made_of)
-        first, *others = (chosen.get(mesh.region_names[number]) for number in np.unique(mesh.region))
-        return first if first is not None and all(one == first for one in others) else chosen
+        return chosen
 
     def _sky_and_ground(self, selection: Selection) -> list[Radiation]:
         sky_c = None if self.sky is None else self._sky_c(self.sky)

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError, HeatMemoryError
-from thermoxels_ns.fem.forms import FixedForm, FluxForm, SourceForm, effect_forms
+from thermoxels_ns.fem.forms import FixedForm, FluxForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
@@ -117,7 +117,7 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     if time is not None and any(effect.changing for effect in problem.effects):
         return []
     forms = effect_forms(problem, Space(problem.selection), 0.0)
-    around_c = [form.surroundings_k(0.0).ravel() for form in forms if not isinstance(form, (FluxForm, SourceForm))]
+    around_c = [form.surroundings_k(0.0).ravel() for form in forms if not isinstance(form, FluxForm)]
     every_c = np.concatenate([np.zeros(0) if time is None else problem.start_c, *around_c])
     ends_c = [every_c.min(), every_c.max()] if len(every_c) else [0.0]
     states_c = np.repeat(np.array(ends_c)[:, None], len(problem.mesh.points_m), axis=1)
