@@ -15,9 +15,9 @@ from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import add_differences, aggregate, correlate, weigh_patches
 
-NEIGHBOURS = 4
-"""Most photographs that each photograph is compared with, its neighbours. At each pixel only the better half of them
-counts, because the surface may be hidden in the other half."""
+NEIGHBOURS = 6
+"""Most photographs that each photograph is compared with, its neighbours. At each pixel only the better half of those
+that show the place counts, because the surface may be hidden in the others, but at least `FEWEST_VIEWS`."""
 ANGLES_DEG = (4.0, 60.0)
 """Least and largest angle between the rays of two photographs to a point at which they are compared. Smaller angles
 tell nothing about depth; at larger angles the surface looks too different."""
@@ -268,12 +268,12 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
-    half, best_yet = -(-len(others) // 2), np.full(view.shape, LEAST_CORRELATION)
+    best_yet = np.full(view.shape, LEAST_CORRELATION)
     at_best = np.full_like(moved, _OUTSIDE)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
-        correlate(view.channels, moved, RADIUS, weights, means, variances, view.noise, half, plane, cost)
+        correlate(view.channels, moved, RADIUS, weights, means, variances, view.noise, FEWEST_VIEWS, plane, cost)
         better = cost[..., plane] >= best_yet
         best_yet[better] = cost[better, plane]
         at_best[:, :, better] = moved[:, :, better]
@@ -285,7 +285,7 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
-        add_differences(moved, expected, limit, np.float32(DIFFERENCE), half, plane, cost)
+        add_differences(moved, expected, limit, np.float32(DIFFERENCE), FEWEST_VIEWS, plane, cost)
     total = np.empty_like(cost)
     aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)

@@ -72,20 +72,22 @@ def weigh_patches(features, channels, radius, likeness, least_weight, noise, wei
 
 
 @kernel(fastmath={"contract"})
-def correlate(channels, others, radius, weights, means, variances, noise, count, plane, result):
-    """Write the mean correlation of each pixel with the best `count` of `others` to ``result[row, column, plane]``.
+def correlate(channels, others, radius, weights, means, variances, noise, fewest, plane, result):
+    """Write the mean correlation of each pixel with the better half of `others` to ``result[row, column, plane]``.
 
     `others` (photographs, c, h, w) are photographs drawn onto the pixels of `channels` (c, h, w); `result` is (h, w,
     planes). `radius`, `weights`, `means`, `variances` and `noise` are those of `weigh_patches`. A correlation is
     normalised cross-correlation of weighted patches with `noise` added to both variances. Channels are averaged by
     their ratio of signal to noise. A channel is left out for a photograph whose patch is masked (below 0) at a corner
-    or in the middle. A photograph without a channel that has a variance counts as `OUTSIDE`.
+    or in the middle. The better half is that of the photographs that have a channel left. It has at least `fewest`
+    photographs, but at most half of all; those that it lacks count as `OUTSIDE`.
     """
     kinds, height, width = channels.shape
     inner = width - 2 * radius
     scores, known = np.empty((len(others), inner), np.float32), np.empty((len(others), inner), np.bool_)
     first, second, both = np.empty(inner, np.float32), np.empty(inner, np.float32), np.empty(inner, np.float32)
-    signal, best = np.empty(inner, np.float32), np.empty(count, np.float32)
+    most = (len(others) + 1) // 2
+    signal, best = np.empty(inner, np.float32), np.empty(most, np.float32)
     result[:radius, :, plane] = OUTSIDE
     result[height - radius :, :, plane] = OUTSIDE
     result[:, :radius, plane] = OUTSIDE
@@ -128,41 +130,49 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
                         known[number, x] = True
         for x in range(inner):
             best[:] = OUTSIDE
+            told = 0
             for number in range(len(others)):
                 score = scores[number, x]
-                for place in range(count if known[number, x] else 0):
+                told += known[number, x]
+                for place in range(most if known[number, x] else 0):
                     if score > best[place]:
                         best[place], score = score, best[place]
-            result[row, x + radius, plane] = best.sum() / count
+            used = min(most, max(fewest, (told + 1) // 2))
+            result[row, x + radius, plane] = best[:used].sum() / used
 
 
 @kernel(fastmath={"contract"})
-def add_differences(others, expected, limit, weight, count, plane, cost):
-    """Add to ``cost[row, column, plane]`` `weight` times the mean difference of the best `count` of `others`.
+def add_differences(others, expected, limit, weight, fewest, plane, cost):
+    """Add to ``cost[row, column, plane]`` `weight` times the mean difference of the better half of `others`.
 
     The difference of a photograph is the mean over channels of |others - expected| / limit, each at most 1. `others`
     and `expected` are (photographs, c, h, w), and `limit` is (photographs, c, 1, 1). A channel is left out if its limit
     is infinite, if `expected` is masked (below -1), or if the other photograph has no temperature (below 0). A
-    photograph that shows no brightness (below 0), or has no channel left, has the difference 1.
+    photograph that shows no brightness (below 0), or has no channel left, has the difference 1. For the better
+    half see `correlate`.
     """
     total, kinds, height, width = others.shape
-    best = np.empty(count, np.float32)
+    most = (total + 1) // 2
+    best = np.empty(most, np.float32)
     for row in range(height):
         for column in range(width):
             best[:] = 1.0
+            seen = 0
             for number in range(total):
                 off, told = np.float32(0.0), 0
                 for channel in range(kinds if others[number, 0, row, column] >= 0.0 else 0):
                     here, own = others[number, channel, row, column], expected[number, channel, row, column]
-                    most = limit[number, channel, 0, 0]
-                    if here >= 0.0 and own > -1.0 and most < np.inf:
-                        off += min(abs(here - own) / most, np.float32(1.0))
+                    largest = limit[number, channel, 0, 0]
+                    if here >= 0.0 and own > -1.0 and largest < np.inf:
+                        off += min(abs(here - own) / largest, np.float32(1.0))
                         told += 1
+                seen += told > 0
                 off = off / told if told else np.float32(1.0)
-                for place in range(count):
+                for place in range(most):
                     if off < best[place]:
                         best[place], off = off, best[place]
-            cost[row, column, plane] += weight * best.sum() / count
+            used = min(most, max(fewest, (seen + 1) // 2))
+            cost[row, column, plane] += weight * best[:used].sum() / used
 
 
 @kernel(fastmath={"contract"})
