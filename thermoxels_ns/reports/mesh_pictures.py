@@ -232,13 +232,9 @@ def draw_surface(
     image = image_of_mesh(mesh, states_c[-1], up=up, title=title, clim=clim, note=note)
     write_picture(folder / HEAT_PICTURES[0], image)
     points, facets, values, view = cut_open(mesh, states_c[-1], up)
-    look: Any = {
-        "title": f"Cut through the middle{when}",
-        "words": [_size_of(mesh, "m")],
-        "up": up,
-        "view_direction": view,
-    }
-    write_picture(folder / HEAT_PICTURES[1], image_of_surface(points, facets, values, **look))
+    title, words = f"Cut through the middle{when}", [_size_of(mesh, "m")]
+    image = image_of_surface(points, facets, values, title=title, words=words, up=up, view_direction=view.tolist())
+    write_picture(folder / HEAT_PICTURES[1], image)
 
 
 def cut_open(
