@@ -23,7 +23,7 @@ from thermoxels_ns.synthetic.random_arrangements import (
     wings,
 )
 from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
-from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, DegreesFunction, RgbFunction, SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
 _NAME = re.compile(r"(?:random|wild)-(0|[1-9][0-9]{0,17})")
@@ -155,19 +155,17 @@ def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, fl
     """Return random lowest and highest surface temperatures [C], and fields of `SyntheticScene` for its background."""
     brightness, spread = np.float32(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
     behind: RgbFunction = sky_rgb if outdoors else room_rgb
+    fields: dict[str, Any] = {
+        "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32)
+    }
     if outdoors:
         air, drop = _degrees(draw.uniform(-10.0, 18.0)), _degrees(draw.uniform(0.2, 0.45) * spread)
         coldest, surface = air - drop, air + float(draw.uniform(-0.5, 2.0))
-        degrees: DegreesFunction = lambda directions: sky_temperature_c(directions, air, drop)  # noqa: E731
+        fields["background_temperature_c"] = lambda directions: sky_temperature_c(directions, air, drop)
     else:
-        coldest = room = _degrees(draw.uniform(12.0, 25.0))
-        surface = room + float(draw.uniform(0.0, 1.5))
-        degrees = plain(room)
-    return (surface, coldest + spread), {
-        "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32),
-        "background_temperature_c": degrees,
-        "temperature_bounds_c": (coldest, coldest + spread),
-    }
+        coldest = _degrees(draw.uniform(12.0, 25.0))
+        surface = coldest + float(draw.uniform(0.0, 1.5))
+    return (surface, coldest + spread), {"temperature_bounds_c": (coldest, coldest + spread), **fields}
 
 
 def _degrees(value: float) -> float:
@@ -231,8 +229,7 @@ def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
     Houses stand all round, up to 14 times the scene's size away; the ground reaches 26 times the scene's size.
     """
-    plan, middle, size, reach, floor = _place(scene, seed)
-    x, y = middle
+    plan, (x, y), size, reach, floor = _place(scene, seed)
     half = 1.3 * _FARTHEST * size
     ground: Box = ((x - half, y - half, floor - 0.2 * size), (x + half, y + half, floor))
     plan.put(ground, plan.paint("ground"), 0.3)
