@@ -20,13 +20,14 @@ import numpy as np
 import numpy.typing as npt
 import tyro
 from measuring import in_own_process, logarithmic_panels, peak_memory_bytes, print_head, print_row, save
+from trimesh import Trimesh
+from trimesh.sample import sample_surface
 
 from tests.support.demo_mesh import exact_snapshot
 from tests.support.looking_cameras import looking_at
 from tests.support.stuffed_shapes import SHAPES
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.evaluation.truth_comparison import sample_facets
 from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
@@ -81,7 +82,8 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
         seconds.append(time.perf_counter() - start)
     peak = peak_memory_bytes() - before
     mesh, quality = built.mesh, check_mesh(built.mesh)
-    distance = np.abs(body.signed_distance(sample_facets(mesh.points_m, mesh.facets, 50_000)))
+    drawn, _ = sample_surface(Trimesh(mesh.points_m, mesh.facets, process=False), 50_000, seed=0)
+    distance = np.abs(body.signed_distance(np.asarray(drawn, np.float64)))
     # Volume of the mesh inside the body, from 35 points evenly spread over each tetrahedron.
     volumes = signed_volumes(mesh.points_m, mesh.tets)
     parts = np.array([s for s in np.ndindex(5, 5, 5, 5) if sum(s) == 4])

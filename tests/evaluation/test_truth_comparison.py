@@ -199,14 +199,11 @@ def test_coarse_lattices_are_judged_by_the_common_voxel(sphere):
     assert coarse["fscore_128"] < 0.5
 
 
-def test_nothing_solid_scores_nothing_and_says_why(sphere):
+def test_nothing_solid_scores_nothing_and_says_why(sphere, capsys):
     snapshot = exact_snapshot(sphere, 16)
-    said: list[str] = []
-    result = geometry_metrics(
-        replace(snapshot, voxel_density=snapshot.voxel_density * 0), IDENTITY, sphere, said.append
-    )
+    result = geometry_metrics(replace(snapshot, voxel_density=snapshot.voxel_density * 0), IDENTITY, sphere)
     assert result == dict.fromkeys((*SCORES, "fscore_128"), 0.0)
-    assert said[0].startswith("The geometry scores 0: solid voxels: expected at least one voxel")
+    assert capsys.readouterr().out.startswith("The geometry scores 0: solid voxels: expected at least one voxel")
 
 
 def exact_rays(

@@ -56,7 +56,7 @@ def rendered(source: str, **shown) -> str:
 
 
 def test_a_table_has_its_entries_in_order_without_those_that_are_none() -> None:
-    table = """{% call parts.table("from1", "A note.") %}{{ parts.head("", "W", none) }}
+    table = """{% call parts.table("from1", "", "W", none, note="A note.") %}
         {% for name in names %}{{ parts.row(name, "12\nat (1, 2)", none) }}{% endfor %}{% endcall %}"""
     text = rendered(table, names=("roof", "wall"))
     outline = Outline(text)
@@ -66,7 +66,7 @@ def test_a_table_has_its_entries_in_order_without_those_that_are_none() -> None:
 
 def test_words_stay_words() -> None:
     source = """{{ parts.warnings([evil]) }}{{ parts.card(evil, evil) }}{{ parts.gallery([(png, evil)]) }}
-        {{ parts.box([evil]) }}{% call parts.table("from1", evil) %}{{ parts.head(evil) }}{{ parts.row(evil) }}
+        {{ parts.box([evil]) }}{% call parts.table("from1", evil, note=evil) %}{{ parts.row(evil) }}
         {{ parts.row(evil ~ "\n" ~ evil) }}{% endcall %}"""
     text = rendered(source, evil=HOSTILE, png=picture("red"))
     assert "<script" not in text

@@ -107,7 +107,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
     names, series = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY), f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
-    folder = result_folder(options.output_dir, (*names, *HEAT_PICTURES), SERIES, series)
+    folder = result_folder(options.output_dir, (*names, *HEAT_PICTURES, series), SERIES)
     run = compute_heat(options, say)
     write_heat_files(folder, options, run, say)
     return run

@@ -173,24 +173,23 @@ def remove_file(path: Path | str) -> None:
         file.unlink(missing_ok=True)
 
 
-def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
+def result_folder(path: Path | str, files: Sequence[str], first: str) -> Path:
     """Make the folder of a command's results, if needed, and return it.
 
     Raises `OutputError` if a folder is in the place of a file or the reverse, or if results exist without `first`.
 
     Args:
-        files: Names of all files in the folder `path` that the command may write.
+        files: Names, or patterns such as ``heat/step-*.vtu``, of all files in `path` that the command may write.
         first: Name of the file that a run writes first. If it is missing, the other files are not the command's.
-        series: Pattern of result files in a subfolder, such as ``heat/step-*.vtu``; None: there are none.
     """
-    folder, steps = writable_folder(path), [] if series is None else [series]
+    folder = writable_folder(path)
     blocked = [name for name in files if (folder / name).is_dir()]
-    blocked += [name for one in steps if (folder / (name := Path(one).parent.name)).is_file()]
+    blocked += [name for one in files if (folder / (name := Path(one).parent.name)).is_file()]
     if blocked:
         expected = f"no folder in the place of a file, and no file in the place of a folder, in {folder}"
         remedy = "Move it away, or choose another folder."
         raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
-    there = [next(folder.glob(name), None) for name in (*files, *steps)]
+    there = [next(folder.glob(name), None) for name in files]
     found = [one.relative_to(folder).as_posix() for one in there if one is not None]
     if found and first not in found:
         expected = f"no files but those of an earlier run of this command in {folder}"

@@ -65,10 +65,9 @@ def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
     direction = along / np.maximum(length, 1e-300)[:, None]
     photograph = np.unique(rays.origins, axis=0, return_inverse=True)[1].reshape(-1)
     key = np.column_stack((direction, 10.0 * photograph))  # far from the keys of all other photographs
-    tree = KDTree(key) if len(key) else None
+    tree = KDTree(key)
     vouched = np.zeros(len(key), dtype=bool)
     for first in range(0, len(key), _RAYS_AT_ONCE):
-        assert tree is not None
         some = slice(first, first + _RAYS_AT_ONCE)
         # The nearest ray of each is itself. A distance is the chord of an angle, or infinite where there is no ray.
         found = tree.query(key[some], NEIGHBOURS + 1, distance_upper_bound=3.0)

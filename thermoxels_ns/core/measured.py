@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from thermoxels_ns.core.checks import is_number
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.yaml_records import wrong
 
 _NUMBER = r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?"
 _WRITTEN = re.compile(rf"\s*({_NUMBER})\s*(?:(?:\+-|\+/-|±)\s*({_NUMBER})\s*)?(\S.*)?", re.DOTALL)
@@ -73,25 +73,22 @@ class Unit:
     above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Return `content` as a `Measured` in this unit; raise ValueError if it is unreadable or out of the limits.
+        """Return `content` as a `Measured` in this unit; raise `RecordError` if it is unreadable or out of the limits.
         `content` is a `Measured` in this unit, a dictionary of its two fields, or what `read_measured` reads."""
-        try:
-            if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
-                value, off_by = content["value"], content["off_by"]
-                if not (is_number(value) and is_number(off_by) and math.isfinite(value) and 0.0 <= off_by < math.inf):
-                    expected, remedy = "finite numbers, off_by of at least 0", "Write 20.0 +- 0.5 C, for example."
-                    raise _wrong("", expected, f"{content!r}", remedy)
-                content = Measured(value, off_by)
-            found = content if isinstance(content, Measured) else read_measured("", content, self.name)
-            low, high = (found.low, found.high) if self.surely else (found.value, found.value)
-            if low < self.low or high > self.high + 1e-12 or (self.above and low <= self.low):
-                above = f"{'above' if self.above else 'of at least'} {self.low:g}" if self.low > -math.inf else ""
-                most = f"at most {self.high:g}" if self.high < math.inf else ""
-                expected = f"a value {'surely ' * self.surely}{' and '.join(filter(None, (above, most)))} [{self.name}]"
-                written = f"{content!r}, which is " if isinstance(content, str) else ""
-                raise _wrong("", expected, f"{written}{found.value:g} +- {found.off_by:g}", "Correct it.")
-        except ThermoxelsError as problem:
-            raise ValueError(problem) from problem
+        if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
+            value, off_by = content["value"], content["off_by"]
+            if not (is_number(value) and is_number(off_by) and math.isfinite(value) and 0.0 <= off_by < math.inf):
+                expected, remedy = "finite numbers, off_by of at least 0", "Write 20.0 +- 0.5 C, for example."
+                raise wrong("", expected, f"{content!r}", remedy)
+            content = Measured(value, off_by)
+        found = content if isinstance(content, Measured) else read_measured("", content, self.name)
+        low, high = (found.low, found.high) if self.surely else (found.value, found.value)
+        if low < self.low or high > self.high + 1e-12 or (self.above and low <= self.low):
+            above = f"{'above' if self.above else 'of at least'} {self.low:g}" if self.low > -math.inf else ""
+            most = f"at most {self.high:g}" if self.high < math.inf else ""
+            expected = f"a value {'surely ' * self.surely}{' and '.join(filter(None, (above, most)))} [{self.name}]"
+            written = f"{content!r}, which is " if isinstance(content, str) else ""
+            raise wrong("", expected, f"{written}{found.value:g} +- {found.off_by:g}", "Correct it.")
         return found
 
     def __get_pydantic_core_schema__(self, *_: Any) -> Any:
@@ -104,7 +101,7 @@ def read_measured(name: str, content: object, unit: str, bare: bool = False) -> 
     """Read a value as people write it, such as ``20.0 +- 0.5 C`` or ``0.93``; return it in `unit`, "1" for no unit.
 
     A comma counts as a decimal point. If `bare` is True, a number without a unit is taken to be in `unit`. Raises
-    `ThermoxelsError`, which starts with `name`, if the text is no number, if its unit is wrong or missing, or if a
+    `RecordError`, which starts with `name`, if the text is no number, if its unit is wrong or missing, or if a
     comma may be one of thousands, as in "1,500".
 
     >>> read_measured("wind", "3,6 +- 1.8 km/h", "m/s")
@@ -117,9 +114,9 @@ def read_measured(name: str, content: object, unit: str, bare: bool = False) -> 
     written, got = _WRITTEN.fullmatch(text), "nothing" if content is None else repr(content)
     if either := _THOUSANDS.search(text):
         remedy = f"Write {either[1]}{either[2]} or {either[1]}.{either[2]}, whichever is meant."
-        raise _wrong(name, "a comma that cannot be one of thousands", got, remedy)
+        raise wrong(name, "a comma that cannot be one of thousands", got, remedy)
     if written is None:
-        raise _wrong(name, "a number" if unit == "1" else f"a number in {unit}", got, f"Write {example}, for example.")
+        raise wrong(name, "a number" if unit == "1" else f"a number in {unit}", got, f"Write {example}, for example.")
     number, off_by, ending = written.groups()
     number, off_by = number.replace(",", "."), off_by and off_by.replace(",", ".")
     known = _UNITS[unit] | ({"": (1.0, 0.0)} if bare else {})
@@ -129,15 +126,11 @@ def read_measured(name: str, content: object, unit: str, bare: bool = False) -> 
     if short not in known:
         says = "without a unit, or in %" if unit == "1" else f"with its unit, {unit}"
         if short:
-            raise _wrong(name, f"a number {says}", got, f"Write {example}, for example.")
+            raise wrong(name, f"a number {says}", got, f"Write {example}, for example.")
         off = "" if off_by is None else f" +- {off_by}"
-        raise _wrong(name, f"a number {says}", f"{got} without one", f"Write {number}{off} {unit}.")
+        raise wrong(name, f"a number {says}", f"{got} without one", f"Write {number}{off} {unit}.")
     factor, summand = known[short]
     value, half = float(number) * factor + summand, float(off_by or 0.0) * factor
     if not (math.isfinite(value) and math.isfinite(half) and half >= 0.0):
-        raise _wrong(name, "a finite number, and behind +- one of at least 0", got, f"Write {example}, for example.")
+        raise wrong(name, "a finite number, and behind +- one of at least 0", got, f"Write {example}, for example.")
     return Measured(value, half)
-
-
-def _wrong(name: str, expected: str, got: str, remedy: str) -> ThermoxelsError:
-    return ThermoxelsError(name, expected=expected, got=got, remedy=remedy)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,7 +62,7 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
     (n,), True if that empty cell is outside the lattice or outside the region `within` (a mask like `cells`)."""
     steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
     for axis in range(3):
-        rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)
+        rise = np.diff(cells.astype(np.int8), axis=axis, prepend=np.int8(0), append=np.int8(0))
         corner = np.argwhere(rise != 0)
         empty = corner.copy()
         empty[:, axis] -= rise[tuple(corner.T)] > 0
@@ -73,14 +73,6 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
         found.append((points, *(np.repeat(x, _PER_SIDE**2, axis=0) for x in (empty, ~within[tuple((empty + 1).T)]))))
     points, empty, on_border = (np.concatenate(each) for each in zip(*found))
     return points, empty, on_border
-
-
-def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Return random points (count, 3), uniform by area, on the triangles `facets` (f, 3), with a fixed seed."""
-    from trimesh import Trimesh
-    from trimesh.sample import sample_surface
-
-    return np.asarray(sample_surface(Trimesh(points, facets, process=False), count, seed=0)[0], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +125,6 @@ class KnownTruth:
         views = self.views(world_to_truth)
         solid = cells | cavities(cells, camera_voxels(cells, lattice, views))[0]
         corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
-        if len(corners) == 0:
-            return SurfaceScore(), SurfaceScore()
         points = apply_transform(world_to_truth, lattice.index_to_world(corners))
 
         def recall(some: FloatArray) -> float:
@@ -249,13 +239,11 @@ def compare_with_truth(
     return result
 
 
-def geometry_metrics(
-    snapshot: GridSnapshot, world_to_input: FloatArray, known: KnownTruth, say: Callable[[str], None] = print
-) -> dict[str, float]:
+def geometry_metrics(snapshot: GridSnapshot, world_to_input: FloatArray, known: KnownTruth) -> dict[str, float]:
     """Return scores, by name, of the surface that an export with default options would have, against the exact scene.
 
     The surface is the boundary of the voxels that `SolidSelection` chooses by default. `world_to_input` (4, 4) is the
-    similarity from the lattice's world to input coordinates. `say` receives the reason if no voxel is solid.
+    similarity from the lattice's world to input coordinates. If no voxel is solid, the reason is printed.
 
     Returns:
         ``fscore``, ``fscore_seen``, ``precision`` and ``recall`` of `compare_with_truth`; ``fscore_128`` and
@@ -270,7 +258,7 @@ def geometry_metrics(
     try:
         solid = select_solid(snapshot, SolidSelection())
     except MeshError as problem:
-        say(f"The geometry scores 0: {problem}")
+        print(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
     own = compare_with_truth(solid.cells, snapshot.lattice, world_to_input, known, within=solid.within)
     assert own is not None  # the truth is known
@@ -339,6 +327,8 @@ def mesh_errors(known: KnownTruth, mesh: TetMesh, tolerance_m: float, metres_per
     only ``mesh_volume_m3`` and ``mesh_area_m2`` are returned.
     """
     import pyvista as pv
+    from trimesh import Trimesh
+    from trimesh.sample import sample_surface
     from trimesh.triangles import points_to_barycentric
 
     result: dict[str, Any] = {
@@ -349,7 +339,8 @@ def mesh_errors(known: KnownTruth, mesh: TetMesh, tolerance_m: float, metres_per
     facets = mesh.facets[mesh.facet_tags != FACET_BOX]
     if len(facets) == 0:
         return result
-    samples = sample_facets(points, facets, _SURFACE_POINTS)
+    drawn = sample_surface(Trimesh(points, facets, process=False), _SURFACE_POINTS, seed=0)[0]
+    samples = np.asarray(drawn, dtype=np.float64)
     outwards = np.abs(scene.solid.signed_distance(samples))
     outwards = outwards[known.counts(samples, outwards <= tolerance_m, tolerance_m)]
     if len(outwards) == 0:

@@ -6,7 +6,6 @@ import base64
 import gzip
 import json
 import math
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from html import escape
@@ -74,7 +73,7 @@ def audit_page(
         report=report,
         gradient=gradient(),
         compared=compared,
-        photographs=defaultdict(tuple, photographs),
+        photographs=photographs,
         confidence=100.0 * CONFIDENCE,
         f_rsi_m2k_w=F_RSI_M2K_W,
         most_defects=MOST_DEFECTS,

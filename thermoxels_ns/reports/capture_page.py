@@ -110,10 +110,8 @@ def capture_page(
     scene, rig = result.scene, result.scene.rig
     errors, known_c = np.concatenate(scene.model.errors_px), temperatures_c[np.isfinite(temperatures_c)]
     off = {**rig.standard_errors, "focal": rig.standard_errors["log_focal"] * rig.thermal_camera.fl_x}
-    frames = []
-    for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
-        own = scene.model.errors_px[index]
-        frames.append((name, frame, len(own), f"{np.median(own):.2f}" if len(own) else "-"))
+    named = zip(scene_names(len(scene.frames)), scene.model.frames, scene.model.errors_px)
+    frames = [(name, frame, len(own), f"{np.median(own):.2f}" if len(own) else "-") for name, frame, own in named]
     return build_page(
         "capture.html.j2",
         name=printable(result.source.resolve().name),

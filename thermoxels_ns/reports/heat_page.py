@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.fem.problem import Varying, effect_labels
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect
@@ -18,10 +17,6 @@ from thermoxels_ns.heat.scene import unit_of
 from thermoxels_ns.reports.numbers import point_text, time_unit, unit_signs
 from thermoxels_ns.reports.page import Report, build_page
 
-_CAPTIONS = {
-    "surface-end.png": "The surface at the end. Colours span the surface that photographs show.",
-    "cut.png": "Cut through the middle at the end. Colours span the whole body.",
-}
 INK, SOFT, LINE = "#1d2430", "#9aa3ae", "#e1e5ea"
 """Colours of the pages' style sheet, ``templates/page.css``."""
 _MOST_CURVES = 8  # Most probes or effects in one plot; more curves look alike
@@ -33,16 +28,12 @@ def heat_page(
     """Return a heat run's page as html; `pictures` are PNG contents by file name, `files` names of files beside it."""
     solution = run.solution
     names = [f"{point_text(point)} m" for point in run.probes_m]
-    over_time = isinstance(solution, HeatSolution)
     return build_page(
         "heat.html.j2",
         run=run,
         probes=list(zip(names, run.probes_c.T)),
-        plot=plot_over_time(solution, run.mean_c, run.probes_c, names) if over_time else "",
-        pictures=[
-            (png, _CAPTIONS[name].replace(" at the end", "") if run.scene.steady else _CAPTIONS[name])
-            for name, png in pictures.items()
-        ],
+        plot=plot_over_time(run, solution, names) if isinstance(solution, HeatSolution) else "",
+        pictures=pictures,
         mesh_name=mesh_name,
         mesh_error=mesh_error_in_words(solution),
         effects=[(label, _values(effect)) for label, effect in zip(effect_labels(run.problem), run.problem.effects)],
@@ -67,11 +58,10 @@ def _values(effect: Effect) -> str:
     return "; ".join(shown)
 
 
-def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
+def plot_over_time(run: HeatRun, solution: HeatSolution, probe_names: Sequence[str]) -> str:
     """Return charts of temperatures over time and, below, of each effect's heat flow, as one svg element.
 
-    `mean_c` is the mean of the volume, shape (s + 1,); `probes_c` has shape (s + 1, p); both are in [degrees Celsius].
-    Heat flows are means over the intervals between the s + 1 times.
+    `solution` is that of the run. Heat flows are means over the intervals between its times.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -88,8 +78,8 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
         FigureCanvasSVG(figure)
         above, below = figure.subplots(2, 1, sharex=True)
         above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
-        above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
-        for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
+        above.plot(times, run.mean_c, label="mean of the volume", color=INK, linewidth=2)
+        for name, values in list(zip(probe_names, run.probes_c.T))[:_MOST_CURVES]:
             above.plot(times, values, label=name.replace("$", r"\$"))  # matplotlib would read $ as a formula
         below.axhline(0.0, color=SOFT, linewidth=0.8)
         for heat in acting:

@@ -38,8 +38,7 @@ def voxel_surface(cells: BoolArray) -> tuple[FloatArray, IntArray]:
     squares = [np.zeros((0, 4, 3), np.int64)]
     for axis in range(3):
         u, v = np.eye(3, dtype=np.int64)[[(axis + 1) % 3, (axis + 2) % 3]]
-        width = [(1, 1) if one == axis else (0, 0) for one in range(3)]
-        low = np.argwhere(np.diff(np.pad(cells, width).astype(np.int8), axis=axis))
+        low = np.argwhere(np.diff(cells, axis=axis, prepend=False, append=False))
         squares.append(low[:, None] + np.stack([0 * u, u, u + v, v]))
     points, corners = np.unique(np.concatenate(squares).reshape(-1, 3), axis=0, return_inverse=True)
     return points.astype(np.float64), corners.reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
@@ -114,13 +113,12 @@ def image_of_surface(
             data["value"] = values[~plain] if of_triangles else values
             start = _DARKEST if colour_map == "inferno" else 0.0
             colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
-            place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
-            size = {"title_font_size": round(height / 38), "label_font_size": round(height / 38)}
             decimals = max(1, 2 - math.floor(math.log10(high - low)))  # so that no two labels are equal
             # From VTK 9.6 on, formats are written as in Python instead of as in printf.
             form = f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f"
             bar_look: Any = {"title": f"{bar_title}\n", "fmt": form, "color": _INK, "unconstrained_font_size": True}
-            bar_look |= {**place, **size}
+            bar_look |= {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
+            bar_look |= {"title_font_size": round(height / 38), "label_font_size": round(height / 38)}
             plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
         for _, colour, which in painted:
             if which.any():
@@ -232,13 +230,9 @@ def draw_surface(
     image = image_of_mesh(mesh, states_c[-1], up=up, title=title, clim=clim, note=note)
     write_picture(folder / HEAT_PICTURES[0], image)
     points, facets, values, view = cut_open(mesh, states_c[-1], up)
-    look: Any = {
-        "title": f"Cut through the middle{when}",
-        "words": [_size_of(mesh, "m")],
-        "up": up,
-        "view_direction": view,
-    }
-    write_picture(folder / HEAT_PICTURES[1], image_of_surface(points, facets, values, **look))
+    title, words = f"Cut through the middle{when}", [_size_of(mesh, "m")]
+    image = image_of_surface(points, facets, values, title=title, words=words, up=up, view_direction=view.tolist())
+    write_picture(folder / HEAT_PICTURES[1], image)
 
 
 def cut_open(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,24 +73,6 @@ class SunLight:
         sun = np.asarray(self.towards) / np.linalg.norm(self.towards)
         facing = np.maximum(np.asarray(normals) @ sun, 0.0)
         return (self.ambient + (1.0 - self.ambient) * facing).astype(np.float32)[:, None]
-
-
-def painted(
-    points: npt.ArrayLike,
-    normals: npt.ArrayLike,
-    part: npt.NDArray[np.integer],
-    paints: Sequence[Paint],
-    texture: SolidTexture,
-    light: SunLight,
-) -> Float32Array:
-    """Return the colour of surface points, (n, 3) in [0, 1]: base colour plus texture, times the brightness.
-
-    Points [m] and unit normals have shape (n, 3); `part` (n,) is the index of each point's paint in `paints`. The
-    brightness is that of `light`. The share that the paint mirrors is ignored here.
-    """
-    base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*((p.base, p.contrast) for p in paints)))
-    colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
-    return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:

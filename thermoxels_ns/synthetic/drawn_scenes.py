@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.appearance import Paint, SunLight, plain, room_rgb, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.appearance import Paint, SunLight, plain, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
 from thermoxels_ns.synthetic.random_scene import (
     painted_scene,
@@ -26,7 +26,7 @@ from thermoxels_ns.synthetic.random_scene import (
     with_street,
 )
 from thermoxels_ns.synthetic.scene_truth import CameraRing, CameraWalk, SyntheticScene, rings_around
-from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
 
 HOUSE = "house-corner"
 _HOUSE_AIR_C, _HOUSE_ROOM_C, _HOUSE_COEFFICIENT = 0.0, 20.0, 8.0
@@ -63,10 +63,9 @@ def hot_object() -> SyntheticScene:
         block_c, ball_c = 68.0 - 25.0 * z, 52.0 - 40.0 * (z - ball.centre[2])
         return _of_nearest(points, (table_c, table), (block_c, lower, upper), (ball_c, ball))
 
-    return _in_a_room(
+    return painted_scene(
         plan,
         texture_seed=11,
-        name="hot-object",
         scene_box=((-0.55, -0.45, -0.14), (0.55, 0.45, 0.34)),
         temperature_bounds_c=(18.0, 70.0),
         surface_temperature_c=temperature_c,
@@ -77,11 +76,10 @@ def hot_object() -> SyntheticScene:
 
 def sphere() -> SyntheticScene:
     """Build one textured ball whose temperature is linear in height, before a uniform background."""
-    return _in_a_room(
+    return painted_scene(
         _plan((Paint((0.66, 0.60, 0.50), 0.32), Sphere((0.0, 0.0, 0.0), 0.5))),
         texture_seed=23,
         light=SunLight(ambient=0.75),
-        name="sphere",
         scene_box=((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6)),
         temperature_bounds_c=(10.0, 40.0),
         surface_temperature_c=lambda points: np.clip(30.0 + 20.0 * np.asarray(points)[:, 2], 20.0, 40.0),
@@ -116,11 +114,10 @@ def pipes() -> SyntheticScene:
         rods = ((62.0 + 3.75 * z, thick), (44.0 - 5.2 * (x - 0.05), middle), (30.0 + 4.7 * z, thin))
         return _of_nearest(points, (wall_c, wall), *rods)
 
-    return _in_a_room(
+    return painted_scene(
         plan,
         texture_seed=41,
         light=SunLight(towards=(0.4, -0.8, 0.5), ambient=0.6),
-        name="pipes",
         scene_box=((-1.42, -0.85, -1.05), (1.42, 0.30, 1.05)),
         temperature_bounds_c=(room_c, 66.0),
         surface_temperature_c=temperature_c,
@@ -184,7 +181,6 @@ def house_corner(white: bool = False) -> SyntheticScene:
         plan,
         texture_seed=7,
         light=SunLight(towards=(0.75, -0.45, 0.5), ambient=0.88 if white else SunLight.ambient),
-        name=HOUSE,
         scene_box=((-3.7, -4.6, -0.8), (4.7, 3.3, 5.8)),
         temperature_bounds_c=(-20.0, 15.0),
         surface_temperature_c=temperature_c,
@@ -273,7 +269,6 @@ def courtyard() -> SyntheticScene:
         plan,
         texture_seed=31,
         light=SunLight(towards=(0.5, -0.7, 0.6)),
-        name="courtyard",
         scene_box=((-5.7, -5.7, -0.8), (5.7, 5.7, 5.1)),
         temperature_bounds_c=(-10.0, 40.0),
         surface_temperature_c=temperature_c,
@@ -297,12 +292,6 @@ def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float =
     for wall, along, height, degrees_c, paint in openings:
         plan.recess(wall, along, height, recess_m, plan.add_paint(paint), degrees_c)
     return plan
-
-
-def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
-    """Return a scene of a plan. By default, its background is a room at the lower of its `temperature_bounds_c`."""
-    room = {"background_rgb": room_rgb, "background_temperature_c": plain(fields["temperature_bounds_c"][0])}
-    return painted_scene(plan, light=light, **(room | fields))
 
 
 def _of_nearest(points: npt.ArrayLike, *bodies: tuple[Any, ...]) -> FloatArray:
@@ -333,16 +322,12 @@ def wall_object() -> SyntheticScene:
     plan.put(Cylinder((-8.0, 0.0, 59.0 + HAIR), 7.0, 14.0, 2), arm, 0.5)
     plan.put(Sphere((-8.0, 0.0, 77.0 + 2.0 * HAIR), 11.0), metal, 0.9)
     plan.spot(trunk, 1.0, 14.0)
-    paint = Paint((0.55, 0.55, 0.55), 0.0)
     scene = warm_scene(
         plan.scaled(0.012),
         texture_seed=23,
         light=SunLight((0.3, -0.8, 0.6), ambient=0.7),
         surface_c=(_ROOM_C + 2.0, 45.0),
-        name="wall-object",
         temperature_bounds_c=(_ROOM_C, 45.0),
-        background_rgb=plain(paint.base),
-        background_temperature_c=plain(_ROOM_C),
         rings=rings_around(
             (0.04, 0.0), (0.52, 1.75, 0.25), (0.52, 1.85, 0.8), (0.5, 1.65, 1.45), start_deg=-160.0, span_deg=140.0
         ),
@@ -350,7 +335,7 @@ def wall_object() -> SyntheticScene:
     )
     # A large upright wall stands behind, at the temperature of the air; the background past its edges has its colour.
     behind_m, half_m = 0.7, 25.0
-    wall = Plan(np.random.default_rng(0), paints=[paint])
+    wall = Plan(np.random.default_rng(0), paints=[Paint((0.55, 0.55, 0.55), 0.0)])
     wall.put(((-half_m, behind_m, -half_m), (half_m, behind_m + 0.1, half_m)), 0)
     scene = surrounded(scene, wall, seed=0, range_k=0.0)
     assert scene.around is not None
@@ -403,8 +388,6 @@ def living_room(corner: bool = False) -> SyntheticScene:
     return painted_scene(
         plan,
         texture_seed=5,
-        light=SunLight(),
-        name="l-room" if corner else "living-room",
         scene_box=((-x - 0.4, -y - 0.4, -0.4), (x + 0.4, y + 0.4, high + 0.4)),
         temperature_bounds_c=(5.0, 50.0),
         surface_temperature_c=temperature_c,
@@ -415,32 +398,19 @@ def living_room(corner: bool = False) -> SyntheticScene:
     )
 
 
-def facade() -> SyntheticScene:
-    """Build the textured front of a house with windows, ledges, a door and a strip of ground, under a plain sky.
+def facade(street: bool = False) -> SyntheticScene:
+    """Build the textured front of a house, 10.4 m wide and 7.6 m high, with windows, ledges, a door and some ground.
 
-    Cameras walk along in front of the house; no camera stands behind it.
+    Three lines of cameras run along its front, and the sky has one colour. With `street`, the front has plain plaster,
+    mirroring panes, no ledges, and a balcony with a railing of 2 cm bars; textured houses stand all round, and the
+    panes mirror those behind the cameras.
     """
-    return _front("facade", Paint((0.70, 0.60, 0.46), 0.25), mirror=0.0, sky=(0.62, 0.72, 0.84), railing=False)
-
-
-def street() -> SyntheticScene:
-    """Build a front of plain plaster with mirroring panes and a balcony with a railing of 2 cm bars, in a street.
-
-    Textured houses stand all round. The panes mirror the houses behind the cameras.
-    """
-    scene = _front("street", Paint((0.80, 0.76, 0.68), 0.0), mirror=0.6, sky=None, railing=True)
-    return with_street(scene, seed=1)
-
-
-def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
-    """Return a scene of a house front, 10.4 m wide and 7.6 m high, with three lines of cameras along it. `mirror` is
-    the panes' share of mirrored light; `sky` is one colour, None: a blue sky; `railing`: add a balcony."""
     plan = Plan(np.random.default_rng(8))
     paints = (
-        wall,
+        Paint((0.80, 0.76, 0.68), 0.0) if street else Paint((0.70, 0.60, 0.46), 0.25),
         Paint((0.46, 0.45, 0.42), 0.26),
         Paint((0.58, 0.55, 0.50), 0.22),
-        Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror),
+        Paint((0.22, 0.30, 0.40), 0.0, mirror=0.6) if street else _GLASS,
         Paint((0.42, 0.24, 0.16), 0.2),
         Paint((0.30, 0.32, 0.34), 0.1),
     )
@@ -456,18 +426,17 @@ def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: b
                 plan.recess((1, -1, 0.0), (-7.0, 7.0), (7.0, 31.0), 3.5, door, 0.6)
                 continue
             plan.recess((1, -1, 0.0), (x - 6.0, x + 6.0), (low, low + 18.0), 3.5, glass, 0.7 + 0.05 * column)
-            if not railing:
+            if not street:
                 plan.put(((x - 8.0, -3.2, low - 3.2), (x + 8.0, 0.0, low)), stone, 0.25)
-    if railing:
+    if street:
         _balcony(plan, stone, metal)
-    return warm_scene(
+    scene = warm_scene(
         plan.scaled(0.1),
         texture_seed=29,
         light=SunLight((0.4, -0.7, 0.6)),
         surface_c=(_AIR_C, 18.0),
-        name=name,
         temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 18.0),
-        background_rgb=sky_rgb if sky is None else plain(sky),
+        background_rgb=sky_rgb if street else plain((0.62, 0.72, 0.84)),
         background_temperature_c=lambda directions: sky_temperature_c(directions, _AIR_C, _SKY_DROP_K),
         rings=tuple(
             CameraWalk(((-x, y, z), (x, y, z)), ((-aim, 0.0, 3.4), (aim, 0.0, 3.4)))
@@ -475,6 +444,7 @@ def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: b
         ),
         focal_share=0.8,
     )
+    return with_street(scene, seed=1) if street else scene
 
 
 def _balcony(plan: Plan, stone: int, metal: int) -> None:
@@ -499,7 +469,7 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "living-room": living_room,
     "l-room": partial(living_room, corner=True),
     "facade": facade,
-    "street": street,
+    "street": partial(facade, street=True),
 }
 DEVELOPMENT_NAMES = ("wall-object", "living-room", "l-room", "facade", "street")
 """Names of hand-drawn scenes that are hard, for development."""

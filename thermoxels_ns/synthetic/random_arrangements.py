@@ -26,9 +26,8 @@ def detached_house(plan: Plan) -> None:
     axis, sign = side // 2, 1 if side % 2 else -1
     shift = [0.0, 0.0]
     shift[axis] = -0.5 * sign * out
-    lo = (shift[0] - 0.5 * width, shift[1] - 0.5 * depth)
-    hi = (shift[0] + 0.5 * width, shift[1] + 0.5 * depth)
-    body: Box = ((*lo, 0.0), (*hi, high))
+    body = _upright((shift[0], shift[1]), (0.5 * width, 0.5 * depth), 0.0, high)
+    lo, hi = body[0][:2], body[1][:2]
     plan.put(body, wall, u(0.25, 0.45))
     plinth = u(6, 9)
     plan.put(_grown((*lo, 0.0), (*hi, plinth), u(SMALLEST, 4.5)), stone, u(0.15, 0.5))

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.synthetic.appearance import Paint
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
+from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight
 from thermoxels_ns.synthetic.solids import (
     Box,
     BoxSolid,
@@ -172,6 +172,18 @@ class Plan:
                 held = piece.shape.contains(inner)
             number[held] = piece.paint
         return number
+
+    def colour(
+        self, points: npt.ArrayLike, normals: npt.ArrayLike, texture: SolidTexture, light: SunLight
+    ) -> Float32Array:
+        """Return the colour of surface points, (n, 3) in [0, 1]: base colour plus texture, times the brightness.
+
+        Points and outward unit normals have shape (n, 3). The share that a paint mirrors is ignored here.
+        """
+        part, kinds = self.part(points, normals), [(paint.base, paint.contrast) for paint in self.paints]
+        base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*kinds))
+        colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
+        return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)
 
     def warmth(self, points: npt.ArrayLike) -> FloatArray:
         """Return the warmth at points (n, 3), shape (n,). It is continuous in space.

@@ -13,15 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
-from thermoxels_ns.synthetic.appearance import (
-    SolidTexture,
-    SunLight,
-    painted,
-    plain,
-    room_rgb,
-    sky_rgb,
-    sky_temperature_c,
-)
+from thermoxels_ns.synthetic.appearance import SolidTexture, SunLight, plain, room_rgb, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.random_arrangements import (
     detached_house,
     facade,
@@ -31,7 +23,7 @@ from thermoxels_ns.synthetic.random_arrangements import (
     wings,
 )
 from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
-from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, DegreesFunction, RgbFunction, SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
 _NAME = re.compile(r"(?:random|wild)-(0|[1-9][0-9]{0,17})")
@@ -47,7 +39,6 @@ _RANGE_K = (15.0, 60.0)
 class Family(NamedTuple):
     """A kind of random scene."""
 
-    name: str
     lay_out: Callable[[Plan], None]  # puts the pieces of a scene into a plan
     size_m: tuple[float, float]  # longest side of the smallest and of the largest scene [m]
     outdoors: float  # share of the scenes that stand under the sky; the others stand in a room
@@ -56,11 +47,11 @@ class Family(NamedTuple):
 
 
 FAMILIES = (
-    Family("detached house", detached_house, (11.0, 20.0), outdoors=1.0),
-    Family("machinery", machinery, (1.2, 5.0), outdoors=0.3),
-    Family("pipes and radiators", pipes_and_radiators, (1.8, 4.0), outdoors=0.15),
-    Family("wings", wings, (14.0, 26.0), outdoors=1.0),
-    Family("facade", facade, (8.0, 14.0), outdoors=1.0, arc_deg=(90.0, 130.0)),
+    Family(detached_house, (11.0, 20.0), outdoors=1.0),
+    Family(machinery, (1.2, 5.0), outdoors=0.3),
+    Family(pipes_and_radiators, (1.8, 4.0), outdoors=0.15),
+    Family(wings, (14.0, 26.0), outdoors=1.0),
+    Family(facade, (8.0, 14.0), outdoors=1.0, arc_deg=(90.0, 130.0)),
 )
 """The kinds of random scenes; the scene of seed N is of kind N modulo their number."""
 
@@ -76,14 +67,11 @@ def random_seed(name: str) -> int | None:
 
 
 def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
-    """Return the scene of a seed, named ``random-`` or ``wild-`` and the seed; the same seed gives the same scene.
+    """Return the scene of a seed; the same seed gives the same scene.
 
     Random scenes have textured walls and a background of smooth gradients. With `wild`, some scenes have plain walls,
     mirroring panes or a thin railing. Their background is, by `seed` modulo 3: smooth gradients (0), one plain colour
     (1), or a street or a room (2).
-
-    >>> random_scene(3).name
-    'random-3'
     """
     draw = np.random.default_rng([_WILD_STREAM if wild else _STREAM, seed])
     family = FAMILIES[seed % len(FAMILIES)]
@@ -107,8 +95,9 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
     start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
     rings = random_rings(draw, [bounds_of(piece.shape) for piece in plan.pieces], focal_share, (start, span))
-    name = f"{'wild' if wild else 'random'}-{seed}"
-    scene = warm_scene(plan, texture_seed, light, surface_c, name=name, rings=rings, focal_share=focal_share, **weather)
+    scene = warm_scene(
+        plan, surface_c, texture_seed=texture_seed, light=light, rings=rings, focal_share=focal_share, **weather
+    )
     kind = seed % 3  # the family is seed % 5, so 15 seeds in a row have every pair of kind and family
     if not wild or kind == 0:
         return scene
@@ -120,9 +109,7 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     return (with_street if outdoors else with_room)(scene, int(draw.integers(2**31)))
 
 
-def warm_scene(
-    plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
-) -> SyntheticScene:
+def warm_scene(plan: Plan, surface_c: tuple[float, float], **rest: Any) -> SyntheticScene:
     """Return the scene of a plan in metres, with surface temperatures that are linear in the plan's warmth.
 
     The least and the greatest warmth become `surface_c`, two temperatures [C]. For `rest` see `painted_scene`.
@@ -138,26 +125,29 @@ def warm_scene(
         share = np.clip((plan.warmth(points) - coldest) / (hottest - coldest), 0.0, 1.0)
         return (1.0 - share) * surface_c[0] + share * surface_c[1]
 
-    return painted_scene(
-        plan, texture_seed, light, solid=solid, scene_box=box, surface_temperature_c=temperature_c, **rest
-    )
+    return painted_scene(plan, solid=solid, scene_box=box, surface_temperature_c=temperature_c, **rest)
 
 
 def painted_scene(
-    plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
+    plan: Plan,
+    *,
+    texture_seed: int,
+    scene_box: Box,
+    light: SunLight = SunLight(),  # noqa: B008 - frozen
+    solid: Solid | None = None,
+    **rest: Any,
 ) -> SyntheticScene:
     """Return the textured scene of a plan in metres; `rest` are further fields of `SyntheticScene`. `solid` must be the
-    plan's solid; None: it is made here."""
+    plan's solid; None: it is made here. By default the background is a room at the lower of `temperature_bounds_c`."""
+    room = {"background_rgb": room_rgb, "background_temperature_c": plain(rest["temperature_bounds_c"][0])}
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
         solid=solid or plan.solid(),
         scene_box=scene_box,
-        colour=lambda points, normals: painted(
-            points, normals, plan.part(points, normals), plan.paints, texture, light
-        ),
+        colour=lambda points, normals: plan.colour(points, normals, texture, light),
         mirror=(lambda points, normals: mirrors[plan.part(points, normals)]) if mirrors.any() else None,
-        **rest,
+        **(room | rest),
     )
 
 
@@ -165,19 +155,17 @@ def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, fl
     """Return random lowest and highest surface temperatures [C], and fields of `SyntheticScene` for its background."""
     brightness, spread = np.float32(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
     behind: RgbFunction = sky_rgb if outdoors else room_rgb
+    fields: dict[str, Any] = {
+        "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32)
+    }
     if outdoors:
         air, drop = _degrees(draw.uniform(-10.0, 18.0)), _degrees(draw.uniform(0.2, 0.45) * spread)
         coldest, surface = air - drop, air + float(draw.uniform(-0.5, 2.0))
-        degrees: DegreesFunction = lambda directions: sky_temperature_c(directions, air, drop)  # noqa: E731
+        fields["background_temperature_c"] = lambda directions: sky_temperature_c(directions, air, drop)
     else:
-        coldest = room = _degrees(draw.uniform(12.0, 25.0))
-        surface = room + float(draw.uniform(0.0, 1.5))
-        degrees = plain(room)
-    return (surface, coldest + spread), {
-        "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32),
-        "background_temperature_c": degrees,
-        "temperature_bounds_c": (coldest, coldest + spread),
-    }
+        coldest = _degrees(draw.uniform(12.0, 25.0))
+        surface = coldest + float(draw.uniform(0.0, 1.5))
+    return (surface, coldest + spread), {"temperature_bounds_c": (coldest, coldest + spread), **fields}
 
 
 def _degrees(value: float) -> float:
@@ -241,8 +229,7 @@ def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
     Houses stand all round, up to 14 times the scene's size away; the ground reaches 26 times the scene's size.
     """
-    plan, middle, size, reach, floor = _place(scene, seed)
-    x, y = middle
+    plan, (x, y), size, reach, floor = _place(scene, seed)
     half = 1.3 * _FARTHEST * size
     ground: Box = ((x - half, y - half, floor - 0.2 * size), (x + half, y + half, floor))
     plan.put(ground, plan.paint("ground"), 0.3)
@@ -321,14 +308,14 @@ def surrounded(
     air_c = float(scene.background_temperature_c([[1.0, 0.0, 0.0]])[0])
 
     def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> Float32Array:
-        points, normals, part = np.asarray(points), np.asarray(normals), plan.part(points, normals)
-        rgb = painted(points, normals, part, plan.paints, texture, light)
+        points, normals, rgb = np.asarray(points), np.asarray(normals), plan.colour(points, normals, texture, light)
         if windows is not None:
             walls, floor, storey = windows
             along = np.where(np.abs(normals[:, 0]) > 0.5, points[:, 1], points[:, 0])
             share = np.mod(np.stack([along, points[:, 2] - floor]) / storey, 1.0)
             glass = np.all((share > _GLASS_SHARE[0]) & (share < _GLASS_SHARE[1]), axis=0)
-            rgb[glass & np.isin(part, walls) & (np.abs(normals[:, 2]) < 0.5)] *= _GLASS_DIM
+            glass[glass] = np.isin(plan.part(points[glass], normals[glass]), walls)
+            rgb[glass & (np.abs(normals[:, 2]) < 0.5)] *= _GLASS_DIM
         return rgb
 
     around = Body(plan.solid(), colour, lambda points: air_c + range_k * np.clip(plan.warmth(points), 0.0, 1.0))

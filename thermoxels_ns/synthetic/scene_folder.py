@@ -129,7 +129,15 @@ def write_scene(
         write_json(target / _BOUNDS, named)
     transforms: dict[str, Any] = flaws.given_camera(camera).entries()
     if layout == "thermalnerf":
-        frames = _separate_frames(frames, transforms, thermal_camera.entries())
+        # All photographs, then all thermal images, each with the entries of its camera; the model is the same for all.
+        own = thermal_camera.entries()
+        kept = {key: transforms.pop(key) for key in own if key != "camera_model"}
+        seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
+        for frame in frames:
+            pose = frame.get("thermal_transform_matrix", frame["transform_matrix"])
+            warm = {"file_path": frame["thermal_file_path"], "transform_matrix": pose}
+            seen.append(warm | own | {"is_thermal": 1})
+        frames = seen
     elif layout != "thermoscenes":  # thermal images belong to the photographs of the same name
         frames = [{key: value for key, value in frame.items() if key != "thermal_file_path"} for frame in frames]
     if own_thermal_camera and layout != "thermalnerf":
@@ -142,20 +150,6 @@ def write_scene(
     else:
         write_json(target / _JSON, transforms)
     return target
-
-
-def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
-    """Return frames as ThermalNeRF has them: all photographs, then all thermal images, each with its camera's entries.
-    `camera` and `own` are the entries of the photographs' and of the thermal camera. All keys of `own` except
-    camera_model are removed from `camera` in place."""
-    poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
-    kept = {key: camera.pop(key) for key in own if key != "camera_model"}
-    seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
-    warm = [
-        {"file_path": frame["thermal_file_path"], "transform_matrix": pose} | own | {"is_thermal": 1}
-        for frame, pose in zip(frames, poses)
-    ]
-    return seen + warm
 
 
 def _write_colmap_model(
@@ -237,14 +231,13 @@ def _thermal_camera(scene: SyntheticScene, width: int, height: int, own: bool) -
 def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
     """Make the folders of a layout, remove an earlier synthetic scene, and return the path; refuse any other scene."""
     target = writable_folder(folder)
-    models = [f"{model}/{part}.txt" for *_, model in _FOLDERS.values() for part in ("cameras", "images", "points3D")]
+    folders = {model for *_, model in _FOLDERS.values() if model}
+    models = [f"{model}/{part}.txt" for model in folders for part in ("cameras", "images", "points3D")]
     if (target / TRUTH).is_file():
         pictures = {f"{name.format('*')}/frame_*" for one in _FOLDERS.values() for name in one[:2] if name}
-        for path in (
-            *(target / name for name in (_JSON, _BOUNDS, *models)),
-            *(p for g in pictures for p in target.glob(g)),
-        ):
-            remove_file(path)  # truth.json stays until it is replaced: it marks the folder as synthetic
+        for pattern in (_JSON, _BOUNDS, *models, *pictures):
+            for path in target.glob(pattern):
+                remove_file(path)  # truth.json stays until it is replaced: it marks the folder as synthetic
         for one in sorted((path for path in target.rglob("*") if path.is_dir()), reverse=True):
             with suppress(OSError):  # an empty folder would tell of another layout
                 one.rmdir()

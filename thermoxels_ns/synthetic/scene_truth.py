@@ -90,7 +90,6 @@ class Body:
 class SyntheticScene(Body):
     """A scene that is known exactly. Lengths are in metres, temperatures in degrees Celsius, z points up."""
 
-    name: str
     scene_box: Box  # lower and upper corner of the box to reconstruct, which contains the solid
     temperature_bounds_c: tuple[float, float]  # bounds of the temperatures of all surfaces and of the background
     background_rgb: RgbFunction  # function of unit directions (n, 3), away from the camera, to colours (n, 3)
@@ -101,6 +100,7 @@ class SyntheticScene(Body):
     """Surroundings, such as houses opposite, that photographs show and that meshes leave out; None: no surroundings."""
     mirror: RgbFunction | None = None
     """Function of points (n, 3) and normals (n, 3) to the share of light (n,) that the surface mirrors; None: 0."""
+    name: str = ""  # name by which `make_scene` returns this scene
 
     @property
     def bodies(self) -> tuple[Body, ...]:
