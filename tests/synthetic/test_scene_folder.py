@@ -8,6 +8,7 @@ from PIL import Image
 
 from tests.support.unreadable import contents
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.synthetic import scene_folder
 from thermoxels_ns.synthetic.imperfections import DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import load_truth, make_scene, write_scene
@@ -122,6 +123,17 @@ def test_real_photographs_have_no_truth_and_are_not_overwritten(tmp_path: Path) 
     with pytest.raises(SceneError):
         write_scene(make_scene("sphere"), tmp_path, **SMALL)
     assert (tmp_path / "transforms.json").read_text() == '{"frames": []}'
+
+
+def test_no_file_outside_the_folder_is_ever_looked_at(tmp_path: Path, monkeypatch) -> None:
+    """A layout without a model of COLMAP once named its files from the root of the disk, and they were removed."""
+    removed: list[Path] = []
+    monkeypatch.setattr(scene_folder, "remove_file", removed.append)
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: removed.append(path) or exists(path))
+    for _ in range(2):
+        write_scene(make_scene("sphere"), tmp_path / "scene", **SMALL)
+    assert removed and all(path.is_relative_to(tmp_path) for path in removed)
 
 
 def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(tmp_path: Path) -> None:
