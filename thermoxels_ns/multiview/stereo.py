@@ -172,6 +172,7 @@ class _View:
 
     channels: Float32Array
     """Brightness and, where the same camera measured it, temperature, shape (1 or 2, h, w); `_OUTSIDE` where masked."""
+    picture: Float32Array  # The channels as OpenCV has them, shape (h, w, 1 or 2)
     features: Float32Array
     """Values by which pixels are compared within the photograph, shape (h, w, 3 or 4): a third of each colour, and
     temperature, which sets a cold sky apart."""
@@ -189,7 +190,8 @@ class _View:
         channels = np.stack([np.nan_to_num(values, nan=_OUTSIDE) for values in (colours.mean(axis=2), *measured)])
         thirds = colours / np.float32(3.0)
         features = np.nan_to_num(np.dstack([thirds, *measured]))
-        return cls(channels, features, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
+        picture = np.ascontiguousarray(channels.transpose(1, 2, 0))
+        return cls(channels, picture, features, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -267,25 +269,23 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
     weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
-    moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
+    moved = np.empty((len(inverse_depths), len(others), *view.channels.shape), dtype=np.float32)
     best_yet = np.full(view.shape, LEAST_CORRELATION)
-    at_best = np.full_like(moved, _OUTSIDE)
-    for plane, inverse_depth in enumerate(inverse_depths):
+    at_best = np.full_like(moved[0], _OUTSIDE)
+    for plane, seen in enumerate(moved):
         for number, other in enumerate(others):
-            _warped(other, view, 1.0 / inverse_depth, moved[number])
-        correlate(view.channels, moved, RADIUS, weights, means, variances, view.noise, FEWEST_VIEWS, plane, cost)
+            _warped(other, view, 1.0 / inverse_depths[plane], seen[number])
+        correlate(view.channels, seen, RADIUS, weights, means, variances, view.noise, FEWEST_VIEWS, plane, cost)
         better = cost[..., plane] >= best_yet
-        best_yet[better] = cost[better, plane]
-        at_best[:, :, better] = moved[:, :, better]
+        np.copyto(best_yet, cost[..., plane], where=better)
+        np.copyto(at_best, seen, where=better)
     cost[(variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
     cost *= -0.5
     cost += 0.5
     correlates = cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)
     expected, limit = _expected_pixels(view, at_best)
-    for plane, inverse_depth in enumerate(inverse_depths):
-        for number, other in enumerate(others):
-            _warped(other, view, 1.0 / inverse_depth, moved[number])
-        add_differences(moved, expected, limit, np.float32(DIFFERENCE), FEWEST_VIEWS, plane, cost)
+    for plane, seen in enumerate(moved):
+        add_differences(seen, expected, limit, np.float32(DIFFERENCE), FEWEST_VIEWS, plane, cost)
     total = np.empty_like(cost)
     aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)
@@ -371,9 +371,10 @@ def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> No
     height, width = view.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     to_other = np.linalg.inv(half) @ turn @ half
-    warped[len(other.channels) :] = _OUTSIDE  # a photograph without temperatures
-    for channel, picture in zip(warped, other.channels):
-        cv2.warpPerspective(picture, to_other, (width, height), channel, flags, cv2.BORDER_CONSTANT, (_OUTSIDE,))
+    border = cv2.BORDER_CONSTANT, (_OUTSIDE, _OUTSIDE)
+    found = cv2.warpPerspective(other.picture, to_other, (width, height), None, flags, *border)
+    warped[:] = _OUTSIDE  # a photograph without temperatures
+    warped[: len(other.channels)] = found.reshape(height, width, -1).transpose(2, 0, 1)
     # Points behind the other camera would be drawn upside down. Depth in that camera is linear over the picture.
     if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
         columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
