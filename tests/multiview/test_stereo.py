@@ -13,7 +13,7 @@ from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.differences import matters, photograph_differences, without_gains
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
-from thermoxels_ns.multiview.stereo_kernels import add_differences
+from thermoxels_ns.multiview.stereo_kernels import add_differences, correlate, weigh_patches
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE
@@ -270,6 +270,28 @@ def test_what_is_endlessly_far_has_depths_far_behind_the_box():
     found = depths(replace(seen, colours=seen.colours + draw.normal(0.0, 0.006, seen.colours.shape).astype(np.float32)))
     assert found.share > 0.8  # 0.67 if differences count for what is matched at infinity
     assert np.nanmin(found.depth) > 2.0 * (1.6 + 0.5)
+
+
+def test_photographs_that_do_not_show_a_place_say_nothing_about_it():
+    """Three that show it: the better two count, whether or not three others look elsewhere. Of six, three count."""
+    draw = np.random.default_rng(1)
+    own = draw.uniform(8.0, 9.0, (1, 12, 14)).astype(np.float32)
+    showing = [(own + draw.normal(0.0, off, own.shape)).astype(np.float32) for off in (1.0, 0.05, 0.1)]
+    noise = np.full(1, 1e-4, np.float32)
+    weights, means, variances = np.empty((25, 12, 14), np.float32), np.empty_like(own), np.empty_like(own)
+    weigh_patches(own[0, ..., None], own, 2, 0.025, 0.05, noise, weights, means, variances)
+
+    def correlation(others: list[np.ndarray]) -> np.ndarray:
+        result = np.empty((12, 14, 1), np.float32)
+        correlate(own, np.stack(others), 2, weights, means, variances, noise, 2, 0, result)
+        return result[2:-2, 2:-2, 0]
+
+    alone, elsewhere = correlation(showing), np.full_like(own, -100.0)
+    assert np.array_equal(correlation([*showing, *3 * [elsewhere]]), alone)
+    assert np.allclose(correlation([*showing[1:], elsewhere]), alone, atol=1e-6), "the better two"
+    assert (correlation([showing[0], *3 * [elsewhere]]) < 0.0).all(), "one alone is not enough"
+    worse = correlation([*showing[1:], *4 * [showing[0]]])
+    assert (worse < alone).all() and (worse > correlation(3 * showing[:1])).all()
 
 
 def test_differences_are_the_least_of_the_better_half_of_the_photographs_that_show_a_pixel():
