@@ -133,24 +133,6 @@ def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
     assert (known & ~shown).sum() <= 0.001 * known.sum()
 
 
-@pytest.mark.parametrize(("liars", "sure"), [(4, False), (9, True)])
-def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars, sure):
-    """Some photographs agree about a plate before the plane, which all others look through."""
-    seen = photographs(CLOSE)
-
-    def sweep(view, near, *span):
-        depth = np.full((SIZE, SIZE), TRUE_DEPTH, np.float32)
-        if np.flatnonzero((seen.centres == view.centre).all(1))[0] < liars:
-            x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (COLUMN, ROW)))
-            depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
-        return depth.ravel(), np.full(SIZE * SIZE, 0.01, np.float32)
-
-    monkeypatch.setattr(stereo, "_sweep", sweep)
-    found = depths(seen).depth
-    assert bool((found == np.float32(1.4)).any()) == sure
-    assert np.mean(found == np.float32(TRUE_DEPTH)) > 0.3
-
-
 @pytest.mark.parametrize(
     "eye", [(0.5, 0.0, 1.6), (0.25, 0.1, 2.6), (0.3, 0.0, 0.9)], ids=["beside", "behind", "before"]
 )
@@ -279,7 +261,7 @@ def test_photographs_that_do_not_show_a_place_say_nothing_about_it():
     showing = [(own + draw.normal(0.0, off, own.shape)).astype(np.float32) for off in (1.0, 0.05, 0.1)]
     noise = np.full(1, 1e-4, np.float32)
     weights, means, variances = np.empty((25, 12, 14), np.float32), np.empty_like(own), np.empty_like(own)
-    weigh_patches(own[0, ..., None], own, 2, 0.025, 0.05, noise, weights, means, variances)
+    weigh_patches(own[0, ..., None], own, 2, 0.025, noise, weights, means, variances)
 
     def correlation(others: list[np.ndarray]) -> np.ndarray:
         result = np.empty((12, 14, 1), np.float32)

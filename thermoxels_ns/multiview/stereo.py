@@ -26,7 +26,6 @@ RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pi
 LIKENESS = 0.025
 """Least scale s, of 1, of the weights exp(-(d / s)^2) in a patch (see `weigh_patches`), where d is the difference of a
 pixel from the middle pixel."""
-LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 256)
 """Least and most planes per photograph. Between these limits the picture moves by about a pixel from plane to plane."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
@@ -47,11 +46,6 @@ EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them cost
 MARGIN = 0.06  # Cost by which the best plane must beat every plane more than two planes away
 FEWEST_VIEWS = 2  # Fewest other photographs that must agree with a depth
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by at most this share of the sum of plane spacings
-VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
-VIEWS_TO_CONTRADICT = 3
-"""A depth may contradict others only if so many other photographs agree with it. F of the facade is 0.974 with this, in
-two seeds, 0.958 if every depth contradicts, 0.959 if none does; wild-14, courtyard, white house differ by no more than
-seeds do."""
 PAIRS_IN_LINE = 3  # Least number, of the four pairs of opposite neighbours, with which a sure pixel must be in line
 LEAST_CORRELATION = 0.6  # Least correlation at which a depth on the farthest plane is accepted
 ERROR_PLANES = 0.1
@@ -98,8 +92,8 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     low correlation plus the difference of the pixels (`DIFFERENCE`). Costs are summed along paths through the
     photograph (Hirschmueller 2008), so that a pixel without texture takes the depth of similar pixels beside it. The
     plane of least cost gives the depth if it beats all planes farther than two planes away by `MARGIN`. A depth is sure
-    if `FEWEST_VIEWS` other photographs have a depth at the same point, if few photographs look through the point, and
-    if the surrounding pixels lie in line with it. Planes reach through the box and behind it; without a box, they reach
+    if `FEWEST_VIEWS` other photographs have a depth at the same point, and if the surrounding pixels lie in line with
+    it. Planes reach through the box and behind it; without a box, they reach
     through the depths at which views overlap.
 
     Args:
@@ -127,10 +121,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
                 depth[pixels], error[pixels] = found
 
     run_ranges(work, len(views), 1)
-    confirmed = other_views(photographs, depth, error)[0] >= VIEWS_TO_CONTRADICT
-    agreeing, behind = other_views(photographs, depth, error, confirmed)
-    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
-    depth[~sure] = np.nan
+    depth[agreeing_views(photographs, depth, error) < FEWEST_VIEWS] = np.nan
     for view, first in zip(views, photographs.firsts):
         pixels = slice(first, first + view.shape[0] * view.shape[1])
         agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
@@ -138,16 +129,13 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     return Depths(photographs, depth, error)
 
 
-def other_views(
-    photographs: Photographs, depth: Float32Array, spacing: Float32Array, confirmed: BoolArray | None = None
-) -> tuple[IntArray, IntArray]:
-    """Return for each pixel the number of other photographs that agree with its depth, and that look through its point.
+def agreeing_views(photographs: Photographs, depth: Float32Array, spacing: Float32Array) -> IntArray:
+    """Return for each pixel the number of other photographs that agree with its depth, (pixels,).
 
     A photograph agrees if its depth at the point differs by at most `TOLERANCE` times the sum of both pixels' `spacing`
-    of planes. It looks through the point if its depth there is `confirmed` and farther by more than twice
-    that sum. All arrays are (pixels,); a `depth` of NaN is unknown.
+    of planes. All arrays are (pixels,); a `depth` of NaN is unknown.
     """
-    agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
+    agreeing = np.zeros(len(depth), dtype=np.int64)
     (known,) = np.nonzero(np.isfinite(depth))
 
     def compare(begin: int, end: int) -> None:
@@ -156,14 +144,11 @@ def other_views(
         points, number = origins + depth[own, None] * along, np.searchsorted(photographs.firsts, own, side="right") - 1
         for other in range(len(photographs)):
             pixel, far, shown = photographs.shown(other, points)
-            farther, planes = depth[pixel] - far, spacing[pixel] + spacing[own]  # NaN fails both comparisons
-            shown &= number != other
-            agreeing[own] += shown & (np.abs(farther) <= TOLERANCE * planes)
-            if confirmed is not None:
-                behind[own] += shown & confirmed[pixel] & (farther > 2.0 * planes)
+            off = np.abs(depth[pixel] - far)  # NaN fails the comparison
+            agreeing[own] += shown & (number != other) & (off <= TOLERANCE * (spacing[pixel] + spacing[own]))
 
     run_ranges(compare, len(known), 1 << 15)
-    return agreeing, behind
+    return agreeing
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +252,7 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     """
     weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
     means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
-    weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
+    weigh_patches(view.features, view.channels, RADIUS, LIKENESS, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(inverse_depths), len(others), *view.channels.shape), dtype=np.float32)
     best_yet = np.full(view.shape, LEAST_CORRELATION)
