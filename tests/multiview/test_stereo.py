@@ -261,7 +261,7 @@ def test_photographs_that_do_not_show_a_place_say_nothing_about_it():
     showing = [(own + draw.normal(0.0, off, own.shape)).astype(np.float32) for off in (1.0, 0.05, 0.1)]
     noise = np.full(1, 1e-4, np.float32)
     weights, means, variances = np.empty((25, 12, 14), np.float32), np.empty_like(own), np.empty_like(own)
-    weigh_patches(own[0, ..., None], own, 2, 0.025, noise, weights, means, variances)
+    weigh_patches(own[0, ..., None], own, 2, 0.025, 0.05, noise, weights, means, variances)
 
     def correlation(others: list[np.ndarray]) -> np.ndarray:
         result = np.empty((12, 14, 1), np.float32)

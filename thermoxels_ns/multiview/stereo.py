@@ -26,6 +26,9 @@ RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pi
 LIKENESS = 0.025
 """Least scale s, of 1, of the weights exp(-(d / s)^2) in a patch (see `weigh_patches`), where d is the difference of a
 pixel from the middle pixel."""
+LEAST_WEIGHT = 0.05
+"""A smaller weight, of 1, is set to 0. Without this, depths of plane photographs that differ by noise alone give gains
+up to 0.6 % off instead of 0.5 %; on a drawn white house nothing changes."""
 PLANES = (24, 256)
 """Least and most planes per photograph. Between these limits the picture moves by about a pixel from plane to plane."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
@@ -252,7 +255,7 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     """
     weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
     means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
-    weigh_patches(view.features, view.channels, RADIUS, LIKENESS, view.noise, weights, means, variances)
+    weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(inverse_depths), len(others), *view.channels.shape), dtype=np.float32)
     best_yet = np.full(view.shape, LEAST_CORRELATION)
@@ -358,8 +361,8 @@ def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> No
     to_other = np.linalg.inv(half) @ turn @ half
     border = cv2.BORDER_CONSTANT, (_OUTSIDE, _OUTSIDE)
     found = cv2.warpPerspective(other.picture, to_other, (width, height), None, flags, *border)
-    warped[:] = _OUTSIDE  # a photograph without temperatures
-    warped[: len(other.channels)] = found.reshape(height, width, -1).transpose(2, 0, 1)
+    shown = found.reshape(height, width, -1).transpose(2, 0, 1)[: len(warped)]
+    warped[: len(shown)], warped[len(shown) :] = shown, _OUTSIDE  # one of the two may have no temperatures
     # Points behind the other camera would be drawn upside down. Depth in that camera is linear over the picture.
     if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
         columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5

@@ -19,7 +19,7 @@ def _difference(features, row, column, i, j):
 
 
 @kernel
-def weigh_patches(features, channels, radius, likeness, noise, weights, means, variances):
+def weigh_patches(features, channels, radius, likeness, least_weight, noise, weights, means, variances):
     """Write adaptive support weights and the weighted mean and variance of the patch around each pixel.
 
     Args:
@@ -27,6 +27,7 @@ def weigh_patches(features, channels, radius, likeness, noise, weights, means, v
         channels: Brightness and perhaps temperature, (c, h, w); below 0 where masked.
         radius: A patch is 2 `radius` + 1 pixels wide.
         likeness: Least scale s of differences. An outline in a patch leaves s small; a texture makes s large.
+        least_weight: A smaller weight is set to 0.
         noise: Variance of the noise of each channel, (c,).
         weights: Receives exp(-(d / s)^2), normalised to sum 1 in each patch, (patch, h, w) (Yoon and Kweon 2006,
             without distance). d is the difference of a pixel's features from the middle pixel's, s the fifth smallest d
@@ -48,7 +49,8 @@ def weigh_patches(features, channels, radius, likeness, noise, weights, means, v
             scale = max(likeness, np.sort(around)[5])  # number 0 is the pixel itself
             for k in range(len(own)):
                 i, j = row - radius + k // side, column - radius + k % side
-                own[k] = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+                weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+                own[k] = weight if weight >= least_weight else 0.0
             weights[:, row, column] = own / own.sum()
             for channel in range(count):
                 mean, square, hidden, k = 0.0, 0.0, False, 0
