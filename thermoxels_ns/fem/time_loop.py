@@ -266,7 +266,8 @@ def _adaptive_steps(balance: HeatBalance, time: AdaptiveSteps, relative_toleranc
         while now_s < end_s:
             left_s = end_s - now_s
             step_s = min(wished_s, system.problem.resolution_s)
-            step_s = left_s if step_s >= left_s else min(step_s, 0.5 * left_s)  # at most half of what is not the last
+            # All that is left of the interval, or at most half of it: no tiny step ends an interval.
+            step_s = left_s if step_s >= left_s else min(step_s, 0.5 * left_s)
             try:
                 step = kutta.step(relative_k, now_s, step_s, estimate=True)
                 error_k, why = step.error_k, f"keeps within {time.tolerance_k:g} K. Something jumps in time: end an"

@@ -16,8 +16,9 @@ from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import add_differences, aggregate, correlate, weigh_patches
 
 NEIGHBOURS = 6
-"""Most photographs that each photograph is compared with, its neighbours. At each pixel only the better half of those
-that show the place counts, because the surface may be hidden in the others, but at least `FEWEST_VIEWS`."""
+"""Most photographs that each photograph is compared with, its neighbours. At each pixel the better half of those that
+show the place counts, but at least `FEWEST_VIEWS`: the surface may be hidden in the others. Six was chosen among 4, 6
+and 8 on street, white house, wild-24 and living-room."""
 ANGLES_DEG = (4.0, 60.0)
 """Least and largest angle between the rays of two photographs to a point at which they are compared. Smaller angles
 tell nothing about depth; at larger angles the surface looks too different."""
@@ -124,7 +125,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
                 depth[pixels], error[pixels] = found
 
     run_ranges(work, len(views), 1)
-    depth[agreeing_views(photographs, depth, error) < FEWEST_VIEWS] = np.nan
+    depth[_agreeing_views(photographs, depth, error) < FEWEST_VIEWS] = np.nan
     for view, first in zip(views, photographs.firsts):
         pixels = slice(first, first + view.shape[0] * view.shape[1])
         agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
@@ -132,7 +133,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike | None = None, hi: npt
     return Depths(photographs, depth, error)
 
 
-def agreeing_views(photographs: Photographs, depth: Float32Array, spacing: Float32Array) -> IntArray:
+def _agreeing_views(photographs: Photographs, depth: Float32Array, spacing: Float32Array) -> IntArray:
     """Return for each pixel the number of other photographs that agree with its depth, (pixels,).
 
     A photograph agrees if its depth at the point differs by at most `TOLERANCE` times the sum of both pixels' `spacing`
@@ -257,6 +258,7 @@ def _sweep(view: _View, others: list[_View], inverse_depths: FloatArray, endless
     means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
     weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
+    # All that is drawn is kept for `add_differences`: 90 MB for 100 planes, six photographs and 160 x 120 pixels.
     moved = np.empty((len(inverse_depths), len(others), *view.channels.shape), dtype=np.float32)
     best_yet = np.full(view.shape, LEAST_CORRELATION)
     at_best = np.full_like(moved[0], _OUTSIDE)

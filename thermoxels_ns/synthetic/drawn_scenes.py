@@ -401,9 +401,9 @@ def living_room(corner: bool = False) -> SyntheticScene:
 def facade(street: bool = False) -> SyntheticScene:
     """Build the textured front of a house, 10.4 m wide and 7.6 m high, with windows, ledges, a door and some ground.
 
-    Three lines of cameras run along its front, and the sky has one colour. With `street`, the front has plain plaster,
-    mirroring panes, no ledges, and a balcony with a railing of 2 cm bars; textured houses stand all round, and the
-    panes mirror those behind the cameras.
+    Three lines of cameras run along its front. The sky has one colour. With `street`, the sky is blue, the front has
+    plain plaster, mirroring panes, no ledges, and a balcony with a railing of 2 cm bars; textured houses stand all
+    round, and the panes mirror those behind the cameras.
     """
     plan = Plan(np.random.default_rng(8))
     paints = (
