@@ -159,7 +159,7 @@ def full() -> GridSnapshot:
         ones,
         np.ones((1, 2, 3), np.float32),
         np.ones((2, 3, 4, 3), np.float32),
-        RayEvidence(np.ones((1, 2, 3), np.float32), *(np.ones(shape, np.float32) for shape in (7, (7, 3), (7, 3)))),
+        RayEvidence(*(np.ones(shape, np.float32) for shape in (7, (7, 3), (7, 3)))),
         Views(np.zeros((5, 3, 4)), np.ones((5, 2)), np.zeros((5, 2)), np.ones((5, 2), np.int64)),
     )
 
@@ -168,7 +168,7 @@ def full() -> GridSnapshot:
 def test_what_cannot_be_is_refused_by_name(part):
     """Another shape, numbers that are not finite, and numbers beyond what they may be."""
     whole = getattr(full(), part)
-    beyond = {"voxel_weight": -1e-3, "half_depth_density": -1.0, "directions": 2.0, "focal": 0.0, "size": 0}
+    beyond = {"half_depth_density": -1.0, "directions": 2.0, "focal": 0.0, "size": 0}
     for name, array in vars(whole).items():
         wrong = [array[..., None]]
         values = [np.nan, np.inf] if array.dtype.kind == "f" else []

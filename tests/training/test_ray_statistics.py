@@ -89,12 +89,10 @@ def test_what_leaks_through_a_surface_measures_nothing_and_ends_nothing_behind_i
     scene = slab(backend)
     layers(scene, {4: -3 * math.log(0.1), 1: 500.0, 0: 500.0})
     _, weight, evidence = field_evidence(*scene, rays_along_minus_x())
-    leaked = evidence.voxel_weight.sum(axis=(1, 2))
     assert len(evidence.ends) == 1600 and 3.0 < evidence.ends[:, 0].min() <= evidence.ends[:, 0].max() < 5.0
     np.testing.assert_array_equal(evidence.directions, np.broadcast_to([-1.0, 0.0, 0.0], (1600, 3)))
     across = torch.cat([bundle.origins[:, 1:] for bundle in rays_along_minus_x()])
     np.testing.assert_allclose(evidence.ends[:, 1:], 3.0 * (across.numpy() + 1.0), atol=1e-4, rtol=0)
-    assert float(leaked[:3].sum()) == pytest.approx(160, rel=0.02)
     weight = weight.view(7, 7, 7)
     assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0
 
@@ -127,12 +125,11 @@ def test_half_depth_lies_behind_a_thin_veil_alone(backend, let_through, wall, fo
     torch.testing.assert_close(torch.from_numpy(density), torch.full((1600,), found or veil / 2))
 
 
-def test_rays_that_end_on_nothing_have_no_half_depth_but_weight(backend):
+def test_rays_that_end_on_nothing_have_no_half_depth(backend):
     scene = slab(backend)
     layers(scene, {2: -3 * math.log(0.55)})
     _, weight, evidence = field_evidence(*scene, rays_along_minus_x())
     assert len(evidence.half_depth_density) == 0
-    assert float(evidence.voxel_weight.sum()) == pytest.approx(0.45 * 1600, rel=0.02)
     assert float(weight.max()) == 0.0
 
 
@@ -147,12 +144,11 @@ def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
     stored, weight, colour = field_evidence(*scene, bundles(lambda _: RGB_STREAM))
     assert float(weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
     assert torch.equal(stored, scene.grid.temperature.data[:, 0].clamp(0, 1))
-    assert float(colour.voxel_weight.sum()) == pytest.approx(1600, rel=1e-4)
     # The first three of six bundles carry both streams.
     half = field_evidence(*scene, bundles(lambda number: RGB_STREAM | THERMAL_STREAM if number < 3 else RGB_STREAM))
     thermal = field_evidence(*scene, [b for n, b in enumerate(rays_along_minus_x()) if n < 3])
     assert torch.equal(half[0], thermal[0]) and torch.equal(half[1], thermal[1])
-    np.testing.assert_array_equal(half[2].voxel_weight, colour.voxel_weight)
+    np.testing.assert_array_equal(half[2].ends, colour.ends)
 
 
 def behind_plane(place: float, backend: Backend) -> Scene:

@@ -80,8 +80,6 @@ class Views:
 class RayEvidence:
     """Evidence from training rays of both streams about where solid matter is."""
 
-    voxel_weight: Float32Array
-    """Sum of the weights of the samples in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: Float32Array
     """For each ray whose opacity exceeds 1/2, the highest density at the centres of the voxels that the ray crosses
     within half a voxel of the point at which half of its weight is spent, shape (rays,), [1 / world unit]."""
@@ -108,7 +106,7 @@ class GridSnapshot:
     colour: Float32Array | None = None
     """Red, green, blue in [0, 1] at the corners, the mean over all directions, shape (*lattice.shape, 3). None: the
     model has no colour."""
-    evidence: RayEvidence | None = None  # Where training rays spent their weight. None: not known
+    evidence: RayEvidence | None = None  # Where training rays end. None: not known
     views: Views | None = None  # The training cameras of both streams. None: not known
 
     def __post_init__(self) -> None:
@@ -121,7 +119,6 @@ class GridSnapshot:
             (self, "observed_weight", corners, -np.inf, np.inf),
             (self, "voxel_density", cells, -np.inf, np.inf),
             (self, "colour", (*corners, 3), 0.0, 1.0),
-            (seen, "voxel_weight", cells, 0.0, np.inf),
             (seen, "half_depth_density", (None,), 0.0, np.inf),
             (seen, "ends", (rays, 3), -np.inf, np.inf),
             (seen, "directions", (rays, 3), -1.01, 1.01),

@@ -67,9 +67,7 @@ def joined(blocks: Sequence[GridSnapshot], shifts: FloatArray) -> tuple[GridSnap
             cell = np.clip(np.floor(ends).astype(np.int64), 0, np.array(lattice.cell_shape) - 1)
             own = of_cells[tuple(cell.T)] == number
             rays.append((one.half_depth_density[own], ends[own], one.directions[own]))
-        weight = gathered([one and one.voxel_weight for one in seen], of_cells)
-        assert weight is not None
-        evidence = RayEvidence(weight, *(np.concatenate(parts) for parts in zip(*rays)))
+        evidence = RayEvidence(*(np.concatenate(parts) for parts in zip(*rays)))
     density, observed = (gathered([getattr(o, n) for o in blocks], of_corners) for n in ("density", "observed_weight"))
     assert density is not None and observed is not None
     whole = GridSnapshot(

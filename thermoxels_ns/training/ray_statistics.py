@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
@@ -96,13 +95,11 @@ def field_evidence(
     device = grid.density.device
     centre_density = grid.voxel_density()
     corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
-    voxels = torch.zeros(len(grid.voxels), dtype=torch.float64, device=device)
     ends, along = [corners.new_zeros(0, 3)], [corners.new_zeros(0, 3)]
     half_depth = [centre_density.view(-1)[:0]]
     seen = False
     for bundle, directions, samples in _sampled(grid, sample, rays):
         seen |= len(directions) > 0
-        voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
         at_half, ray = samples.at.select(half_way), samples.ray[half_way]
         voxel = torch.stack(torch.unravel_index(grid.cells[at_half.number], grid.lattice.cell_shape), -1)
@@ -123,10 +120,7 @@ def field_evidence(
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
     evidence = None
     if seen:
-        voxel_weight = np.zeros(grid.lattice.cell_shape, dtype=np.float32)
-        voxel_weight.reshape(-1)[grid.voxels.cells] = voxels.cpu()
-        of_rays = (torch.cat(parts).float().cpu().numpy() for parts in (half_depth, ends, along))
-        evidence = RayEvidence(voxel_weight, *of_rays)
+        evidence = RayEvidence(*(torch.cat(parts).float().cpu().numpy() for parts in (half_depth, ends, along)))
     return thermal.clamp(0, 1), weight, evidence
 
 

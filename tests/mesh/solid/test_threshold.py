@@ -11,7 +11,6 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.mesh.solid.voxels import (
     FEWEST_RAYS,
-    OPAQUE_OPTICAL_DEPTH,
     OPTICAL_DEPTH_BOUNDS,
     SHARE_OF_RAYS,
     SolidSelection,
@@ -27,22 +26,12 @@ MET = np.repeat(np.arange(1.0, 11.0), [30, 130, *[105] * 8])
 """Densities that 1,000 rays meet where they end: 3 % of them one that is too low."""
 
 
-def field(
-    voxel_density: np.ndarray, met: np.ndarray, weight: np.ndarray | None = None, ends: np.ndarray | None = None
-) -> GridSnapshot:
-    """A field with the given voxels, and rays that meet the given densities where they end.
-
-    `ends` counts the rays that end in the middle of each voxel, downwards; None: all end outside of the lattice.
-    """
+def field(voxel_density: np.ndarray, met: np.ndarray) -> GridSnapshot:
+    """A field with the given voxels, and rays that meet the given densities where they end, outside of the lattice."""
     lattice = Lattice((0.0, 0.0, 0.0), VOXEL, tuple(n + 1 for n in voxel_density.shape))  # type: ignore[arg-type]
-    weight = np.zeros_like(voxel_density) if weight is None else weight
     zero = np.zeros(lattice.shape, dtype=np.float32)
-    middles = np.full((len(met), 3), -9.0)
-    if ends is not None:
-        counts = ends.astype(np.int64).ravel()
-        middles = np.stack(np.unravel_index(np.repeat(np.arange(counts.size), counts), ends.shape), axis=1) + 0.5
-    of_rays = [middles.astype(np.float32), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(middles), 1))]
-    evidence = RayEvidence(weight.astype(np.float32), met.astype(np.float32), *of_rays)
+    down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(met), 1))
+    evidence = RayEvidence(met.astype(np.float32), np.full((len(met), 3), -9.0, np.float32), down)
     density = voxel_density.astype(np.float32)
     return GridSnapshot(lattice, zero, zero, zero, voxel_density=density, evidence=evidence)
 
@@ -72,35 +61,6 @@ def test_the_threshold_stays_within_bounds(scale, bound):
     density[0] = 1.0  # so that something is solid at the lower bound
     chosen = automatic(field(density, MET * scale))
     assert chosen.density == pytest.approx(OPTICAL_DEPTH_BOUNDS[bound] / VOXEL)
-
-
-def leak() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Density, weight and ends: a little light leaks through the wall at z = 5 to one as dense at z = 3."""
-    density, weight, ends = np.zeros((3, 10, 10, 10))
-    density[:, :, 5] = density[:, :, 3] = 2.5
-    weight[:, :, 5], ends[:, :, 5] = 10.0, 10.0
-    weight[:, :, 3] = 0.8
-    return density, weight, ends
-
-
-def test_voxels_in_which_no_ray_ends_are_solid_only_if_they_are_opaque():
-    density, weight, ends = leak()
-    density[:4, :, 3] = 1.01 * OPAQUE_OPTICAL_DEPTH / VOXEL
-    density[4:8, :, 3] = 0.99 * OPAQUE_OPTICAL_DEPTH / VOXEL
-    chosen = automatic(field(density, MET, weight, ends))
-    assert chosen.density == 2.0
-    assert chosen.cells[:, :, 5].all() and chosen.cells[:4, :, 3].all() and chosen.cells.sum() == 140
-
-
-def test_a_few_dense_voxels_behind_a_surface_do_not_widen_the_body():
-    """Without the weight that rays spent there the body would reach down to them."""
-    density, weight, ends = leak()
-    density[:, :, 3] = 0.0
-    density[2, 2, 3] = density[7, 7, 3] = 2.5
-    whole = field(density, MET, weight, ends)
-    assert not select_solid(whole, SolidSelection(region="all")).cells[:, :, :5].any()
-    blind = replace(whole, evidence=replace(whole.evidence, voxel_weight=np.zeros_like(whole.evidence.voxel_weight)))
-    assert select_solid(blind, SolidSelection(region="all")).cells[:, :, 3].any()
 
 
 def test_without_evidence_the_rule_is_an_optical_depth_and_says_so():
@@ -179,15 +139,3 @@ def test_soft_and_sharp_surfaces_lie_within_half_a_voxel_of_where_rays_end(place
     # Density 40 at the place, e^steepness times as much a voxel farther in, fog in front.
     field = Layers(np.maximum(np.log(40.0) + steepness * (place - np.arange(17.0)), np.log(before)))
     assert abs(surface_of(field.snapshot()) - field.half_way()) <= 0.5
-
-
-def test_what_a_surface_lets_through_makes_nothing_solid_behind_it():
-    """A wall of optical depth 3 lets 5 % through to one of 1.5, behind which no camera could see anything."""
-    logarithm = np.full(17, np.log(EMPTY))
-    logarithm[9:11], logarithm[4:6] = np.log(3.0 / LAYERS.voxel_size), np.log(1.5 / LAYERS.voxel_size)
-    field = Layers(logarithm)
-    snapshot = field.snapshot()
-    assert abs(surface_of(snapshot) - field.half_way()) <= 0.5
-    cells = automatic(snapshot).cells
-    assert cells.any(axis=(1, 2)).nonzero()[0].tolist() == [9] and cells[9].all()
-    assert snapshot.evidence is not None and snapshot.evidence.voxel_weight[4].sum() > 40.0  # of 1,600 rays

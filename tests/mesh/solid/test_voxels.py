@@ -106,7 +106,7 @@ def test_the_solid_ends_where_rays_end_unless_the_user_chose_its_density():
     along = np.tile([1.0, 0.0, 0.0], (len(ends), 1))
     of_rays = (values.astype(np.float32) for values in (np.full(len(ends), 50.0), ends, along))
     whole = field(lattice, block | lump, None)
-    snapshot = replace(whole, evidence=RayEvidence(np.zeros(lattice.cell_shape, np.float32), *of_rays))
+    snapshot = replace(whole, evidence=RayEvidence(*of_rays))
     solid = select_solid(snapshot, AS_IT_IS)
     first = box(lattice, (6.0, 0.0, 0.0), (7.0, 20.0, 20.0))
     assert np.array_equal(solid.cells, block & ~first) and solid.distance is not None

@@ -201,12 +201,6 @@ def without_front(cells: BoolArray, evidence: RayEvidence, distance: Float32Arra
     return kept if kept.any() else cells
 
 
-def ends_in_voxels(evidence: RayEvidence, shape: tuple[int, ...]) -> IntArray:
-    """Return the number of rays that end in each voxel, shape `shape`."""
-    number = np.ravel_multi_index(tuple(_voxels_at(evidence.ends, shape)[0].T), shape)
-    return np.bincount(number, minlength=math.prod(shape)).reshape(shape)
-
-
 def solid_at(cells: BoolArray, points: FloatArray | Float32Array) -> BoolArray:
     """Return True for points (n, 3), in corner indices, in solid voxels, shape (n,); False outside the lattice."""
     voxel, inside = _voxels_at(points, cells.shape)

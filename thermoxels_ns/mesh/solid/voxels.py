@@ -15,13 +15,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.yaml_records import record, wrong
-from thermoxels_ns.mesh.solid.free_space import (
-    MOST_CAMERAS,
-    distance_to_ends,
-    ends_in_voxels,
-    first_solid,
-    without_front,
-)
+from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, distance_to_ends, first_solid, without_front
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 
@@ -38,11 +32,6 @@ SHARE_OF_RAYS = 0.95  # share of the rays that end on something that shall meet 
 OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
 """Bounds of the automatic threshold, as density times voxel edge. At the first, a ray needs 35 voxels to lose half of
 its light, as in half-transparent space. At the second, a single voxel stops half of the light, as a surface does."""
-OPAQUE_OPTICAL_DEPTH = 2.0  # a dense voxel of at least this density times voxel edge is solid even if no ray ends in it
-SHARE_THAT_ENDS = 0.5
-"""A voxel stops rays if the number of rays that end in it exceeds this share of the weight that rays spent in it. The
-ratio of the two is 1 if all rays that enter the voxel end in it, and 0 if light only leaked past a surface."""
-LEAST_WEIGHT = 0.5  # if rays spent less weight than this in a voxel, [rays], its density alone decides
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # quantile of the distances to solid along these rays at which the camera is said to point
@@ -200,7 +189,7 @@ def _large_bodies(cells: BoolArray, least: float) -> tuple[BoolArray, IntArray]:
 class Threshold:
     """The density threshold that was chosen, and the voxels that reach it."""
 
-    cells: BoolArray  # True where a voxel is dense enough and rays do not rule it out, shape `lattice.cell_shape`
+    cells: BoolArray  # True where a voxel is dense enough, shape `lattice.cell_shape`
     density: float  # least density at the centre of a voxel that is dense enough, [1 / world unit]
     explanation: str  # one or two sentences on which rule chose the threshold, and why
     by_rays: bool = False  # True if training rays chose the threshold
@@ -234,19 +223,14 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
     A ray ends at the point at which half of its weight is spent. The ray meets the densest voxel within half a voxel of
     that point (`RayEvidence.half_depth_density`). The threshold is the highest density that the share `SHARE_OF_RAYS`
     of the rays meet or exceed, kept within `OPTICAL_DEPTH_BOUNDS`: nearly all rays end on solid voxels.
-
-    Density in voxels in which rays spend weight but hardly end comes from light that leaked past a surface. These
-    voxels would thicken the body by a layer, so they are solid only from `OPAQUE_OPTICAL_DEPTH` on.
     """
-    met, weight = evidence.half_depth_density, evidence.voxel_weight
+    met = evidence.half_depth_density
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
-    passed = (ends_in_voxels(evidence, density.shape) <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
-    cells = (density >= np.float32(threshold)) & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     share = float(np.mean(met >= np.float32(threshold)))
     return Threshold(
-        cells,
+        density >= np.float32(threshold),
         threshold,
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
         f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel).",
