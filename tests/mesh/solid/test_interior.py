@@ -112,19 +112,6 @@ def test_blocks_give_the_same_inside(monkeypatch):
         assert np.array_equal(found, expected)
 
 
-def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
-    """One side of a box is a chessboard with squares of four voxels; most cameras look at the other side."""
-    cells = box(5, 19) & ~box(6, 18)
-    y, z = np.indices((14, 14))
-    cells[18, 5:19, 5:19] = (y // 4 + z // 4) % 2 == 0
-    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, 20)
-    before = np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(20, 14.0)))
-    eyes = np.vstack((before, [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
-    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 1)
-    assert not found[~box(5, 19)].any()
-    assert (cells | found)[box(5, 19)].mean() > 0.88
-
-
 def test_the_long_shadow_between_posts_on_a_plate_is_not_their_inside(monkeypatch):
     """It is hidden and within the hull, but next to it there is more air than surface."""
     lattice = Lattice((0.0, 0.0, 0.0), 1.0, (73, 25, 25))

@@ -19,7 +19,6 @@ LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block 
 SHADOW_SURROUNDED = 0.1
 """Least winding number of the seen surfaces at which voxels hidden by the shell count as inside. The number is up to
 one half behind a surface seen from one side only, and at most 0 in the shadow before a wall."""
-CREVICE_SURROUNDED = 0.3  # least winding number at which voxels hidden by the filled inside count as inside
 STRAY_SHARE = 0.005  # share of a body's voxels on each side, in the outermost layers, that may be strays
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
 MARGIN = 0.25  # the winding number is set to 0 at this share of the lattice's size outside the lattice, on each side
@@ -35,15 +34,14 @@ def interior(
     First, openings of the shell up to twice `seal` voxels wide are closed; voxels that then touch are one body. A voxel
     is inside if it is in a cavity: empty space without a camera and without a way out through voxel faces. If cameras
     are known (`views`), a voxel of a body's convex hull is also inside if it lies in a camera's image, the shell hides
-    it from cameras (`count_cameras`), and the backs of seen surfaces surround it (`winding_number`). A second pass
-    treats the voxels found as solid, and adds crevices that they hide and surfaces surround (`CREVICE_SURROUNDED`).
+    it from cameras (`count_cameras`), and the backs of seen surfaces surround it (`SHADOW_SURROUNDED`).
 
     The result is restricted to the region `within` (None: everywhere); solid outside it still blocks the view.
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     inside, room = _enclosed(cells, sealed, lattice, views, seal)
     if views is not None and len(views.focal):
-        inside |= _hidden(sealed, within, lattice, views, seal) & ~cells
+        inside |= _hidden(sealed, within, lattice, views) & ~cells
         # Cavities that the filled space encloses are inside as well.
         inside |= cavities(cells | inside, room | camera_voxels(cells, lattice, views))[0]
     return inside & within
@@ -94,40 +92,31 @@ def cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray
     return (kept & ~rooms)[labels], rooms[labels]
 
 
-def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
+def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
     """Return a mask of voxels in a body's convex hull that no camera sees and that seen surfaces surround."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
     if block > 1:
-        return _hidden_in_blocks(sealed, within, lattice, views, seal, block)
+        return _hidden_in_blocks(sealed, within, lattice, views, block)
     # The convex hull of every body is taken without its strays.
     labels, hull = connected(sealed & within), np.zeros_like(sealed)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         hull[box] |= convex_hull(_without_strays(labels[box] == number))
     if not (hull & ~sealed).any():
         return np.zeros_like(hull)
-    shadow = _behind(sealed, lattice, views, SHADOW_SURROUNDED) & hull
-    crevices = _behind(close_gaps(sealed | shadow, seal), lattice, views, CREVICE_SURROUNDED) & hull
-    return shadow | crevices
+    counts = count_cameras(sealed, lattice, views)
+    return counts.hidden & hull & (winding_number(sealed, counts.seen & ~sealed) >= SHADOW_SURROUNDED)
 
 
-def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
-    """Return a mask of voxels that are hidden from cameras and have a winding number of at least `surrounded`."""
-    counts = count_cameras(cells, lattice, views)
-    return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
-
-
-def _hidden_in_blocks(
-    sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int, block: int
-) -> BoolArray:
+def _hidden_in_blocks(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, block: int) -> BoolArray:
     """Return the result of `_hidden` at lower resolution, with one answer for each block of `block`^3 voxels."""
     shape = sealed.shape
     padded = np.pad((sealed, within), [(0, 0), *((0, -n % block) for n in shape)])
     cx, cy, cz = (n // block for n in padded.shape[1:])
     coarse, coarse_within = padded.reshape(2, cx, block, cy, block, cz, block).any(axis=(2, 4, 6))
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
-    hidden = _hidden(coarse, coarse_within, coarse_lattice, views, seal // block)
+    hidden = _hidden(coarse, coarse_within, coarse_lattice, views)
 
     # The empty voxels of a block with a piece of the shell are inside if they are connected to a hidden block.
     inside = tuple(slice(n) for n in shape)
