@@ -16,11 +16,11 @@ from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, grow
 
 LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
-SHADOW_SURROUNDED = 0.2
+SHADOW_SURROUNDED = 0.15
 """Least winding number of the seen surfaces at which voxels hidden by the shell count as inside. The number is up to
-one half behind a surface seen from one side only, and at most 0 in the shadow before a wall. Chosen among 0.1, 0.2, 0.3
-and 0.5 on house-corner, white house, street, wild-2, 12, 14 and 17: less fills the space between separate bodies, more
-leaves buildings hollow."""
+one half behind a surface seen from one side only, and at most 0 in the shadow before a wall. Chosen among 0.1, 0.12,
+0.15, 0.2, 0.3 and 0.5 on facade, street, wild-2 and wild-14: less fills the space between separate bodies, more leaves
+them hollow behind surfaces seen from one side."""
 STRAY_SHARE = 0.005  # share of a body's voxels on each side, in the outermost layers, that may be strays
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
 MARGIN = 0.25  # the winding number is set to 0 at this share of the lattice's size outside the lattice, on each side
