@@ -66,6 +66,8 @@ def test_blocks_of_one_field_become_it_again() -> None:
     np.testing.assert_allclose(found.centre_density(), whole.centre_density(), rtol=1e-6)
     order = [np.lexsort(one.evidence.ends.T.round(4)) for one in (found, whole)]
     np.testing.assert_allclose(found.evidence.ends[order[0]], whole.evidence.ends[order[1]], atol=1e-5)
+    met = [one.evidence.half_depth_density[rows] for one, rows in zip((found, whole), order)]
+    np.testing.assert_array_equal(*met)
     poses = [one.views.camera_to_world[np.argsort(one.views.camera_to_world[:, 0, 3])] for one in (found, whole)]
     np.testing.assert_allclose(*poses, atol=1e-12)
     assert [np.unique(layer).tolist() for layer in owner] == [[0]] * 7 + [[1]] * 6 + [[2]] * 7

@@ -36,7 +36,7 @@ FEWEST_RAYS = 6.0
 """Least number of rays, in the steps to come, per voxel of a surface for a refinement that the user did not ask for. In
 standard quality it was 2.6 to 4.3 in five scenes that have no worse images without the last refinement (living-room,
 l-room, wild-14, ARCO, saharov32; F of l-room falls by 0.012) and 7.8 to 33 in thirty others, which were not tried. It
-depends on the box: with the box that six neighbours in stereo give, wild-14 has 7.8, is refined, and loses 0.025 F."""
+depends on the box: with the box that six neighbours in stereo give, wild-14 has 7.8, is refined, and loses 0.01 F."""
 MOST_OPENED_RAYS = 0.01  # Largest share, of the rays of opacity above one half, that pruning may open
 OPAQUE_DEPTH = 0.7  # Least optical depth across an opaque voxel: half of the light is lost
 PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # Number of lines of progress; a line comes at least this often
