@@ -87,6 +87,15 @@ def test_what_the_shell_hides_from_all_cameras_is_inside_even_if_it_is_open_wher
     assert convex_hull(cells)[:, :, 3:5].sum() > 10  # what would be filled
 
 
+def test_a_facade_seen_from_one_side_is_filled_as_deep_as_its_sides_go():
+    """Hardly half of what surrounds its inside is seen; with a winding number of 0.5 a quarter of it stays empty."""
+    cells, inside = (np.zeros((N, N, N), dtype=bool) for _ in range(2))
+    cells[11:19, 4:20, 4:20], inside[11:17, 6:18, 4:18] = True, True
+    eyes = [(70.0, y, z) for y in (-60.0, -30.0, 0.0, 12.0, 24.0, 54.0, 84.0) for z in (14.0, 60.0)]
+    found = interior(cells & ~inside, LATTICE, looking_at(MIDDLE, eyes), 0)
+    assert found[inside].mean() > 0.99 and not found[~inside].any()
+
+
 def test_a_plate_and_two_bodies_side_by_side_have_no_inside():
     plate = np.zeros((N, N, N), dtype=bool)
     plate[12] = True
